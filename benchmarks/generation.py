@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from benchmarks.measure import Row, compare
 from benchmarks.peers import generation_peers
 from ccnn_torch.evolution import CCNNSettings
-from ccnn_torch.evolution.coevolution import advance, start
-from ccnn_torch.evolution.evaluation import make_task
+from ccnn_torch.evolution.breeding import CONTESTANTS, CUTS, EXPONENT
+from ccnn_torch.evolution.coevolution import REPRESENTATIVES, advance, start
+from ccnn_torch.evolution.evaluation import EPSILON, make_task
 
 Array = NDArray[np.float64]
 Individual = tuple[NDArray[np.bool_], Array]
@@ -37,7 +38,7 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
         settings = CCNNSettings(hidden=tuple(SIZES[1:-1]), population=population, generations=120)
         individuals = 3 * population
         peers = {}
-        for networks in (individuals * (1 + settings.representatives), individuals) if population <= 800 else ():
+        for networks in (individuals * (1 + REPRESENTATIVES), individuals) if population <= 800 else ():
             found = generation_peers(SIZES, row_errors, rows, networks)
             peers |= {f"{name}, {networks:,} whole networks": call for name, call in found.items()}
         if population <= 800:
@@ -119,12 +120,12 @@ class NumpyLoop:
         settings, random = self.settings, self.random
         parents = []
         for _ in range(2):
-            drawn = random.integers(len(population), size=settings.tournament)
+            drawn = random.integers(len(population), size=CONTESTANTS)
             mask, weight = population[drawn[np.argmax(fitness[drawn])]]
             parents.append((mask.copy(), weight.copy()))
         (mask, weight), (other_mask, other_weight) = parents
         if random.random() < settings.crossover:
-            places = np.arange(weight.size)[:, None] >= random.integers(1, weight.size, settings.cuts)
+            places = np.arange(weight.size)[:, None] >= random.integers(1, weight.size, CUTS)
             swap = (places.sum(1) % 2 == 1).reshape(weight.shape)
             bits = swap[:, :-1]
             mask[bits], other_mask[bits] = other_mask[bits], mask[bits].copy()
@@ -136,7 +137,7 @@ class NumpyLoop:
         active = np.concatenate([other_mask, np.ones((len(other_mask), 1), dtype=bool)], axis=1)
         draws = np.where(active, random.random(other_weight.shape), 1.0)
         chosen = ((draws < settings.weight_mutation) | (draws == draws.min())) & active
-        progress = (1 - self.done / settings.generations) ** settings.nonuniform_exponent
+        progress = (1 - self.done / settings.generations) ** EXPONENT
         share = 1 - random.random(other_weight.shape) ** progress
         bound = np.where(random.random(other_weight.shape) < 0.5, settings.weight_range, -settings.weight_range)
         other_weight[chosen] += ((bound - other_weight) * share)[chosen]
@@ -146,8 +147,7 @@ class NumpyLoop:
         settings = self.settings
         size = settings.population
         sets = [self.best] + [
-            [population[self.random.integers(size)] for population in self.populations]
-            for _ in range(settings.representatives)
+            [population[self.random.integers(size)] for population in self.populations] for _ in range(REPRESENTATIVES)
         ]
         scores = np.zeros(size)
         for number, individual in enumerate(self.populations[layer]):
@@ -167,4 +167,4 @@ class NumpyLoop:
                 fed = (mask & fed).any(1)
                 signal = fed / (1 + np.exp(-signal))
         error = np.sqrt(((signal - self.targets) ** 2).sum(1)).mean()
-        return 1 / (float(error) + self.settings.epsilon)
+        return 1 / (float(error) + EPSILON)

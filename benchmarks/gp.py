@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import warnings
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
-import gpytorch
 import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
@@ -25,15 +27,15 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
     for rows in (30, 60, 120) if quick else (100, 300, 1000):
         data = training_rows(rows)
         x, y = data.inputs[0], data.targets[0]
+        peers: dict[str, Any] = {"scikit-learn": lambda x=x, y=y: scikit(x, y)}
+        if find_spec("gpytorch"):
+            peers[f"GPyTorch, {STEPS} steps of Adam"] = lambda x=x, y=y: plain_gpytorch(x, y)
         yield from compare(
             "fit a Gaussian process, 3 outputs",
             rows,
             "rows",
             lambda data=data: train(make_learner("gp"), data),
-            {
-                "scikit-learn": lambda x=x, y=y: scikit(x, y),
-                f"GPyTorch, {STEPS} steps of Adam": lambda x=x, y=y: plain_gpytorch(x, y),
-            },
+            peers,
             rounds=1,
         )
 
@@ -47,23 +49,24 @@ def scikit(x: torch.Tensor, y: torch.Tensor) -> None:
             GaussianProcessRegressor(kernel, normalize_y=True).fit(x.numpy(), output.numpy())
 
 
-class _Exact(gpytorch.models.ExactGP):  # type: ignore[misc]
-    def __init__(self, x: torch.Tensor, y: torch.Tensor, likelihood: gpytorch.likelihoods.GaussianLikelihood) -> None:
-        super().__init__(x, y, likelihood)
-        shape = x.shape[:1]
-        self.mean_module = gpytorch.means.ConstantMean(batch_shape=shape)
-        matern = gpytorch.kernels.MaternKernel(1.5, ard_num_dims=x.shape[-1], batch_shape=shape)
-        self.covar_module = gpytorch.kernels.ScaleKernel(matern, batch_shape=shape)
-
-    def forward(self, x: torch.Tensor) -> gpytorch.distributions.MultivariateNormal:
-        return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
-
-
 def plain_gpytorch(x: torch.Tensor, y: torch.Tensor) -> None:
     """All outputs as a batch."""
+    gpytorch: Any = importlib.import_module("gpytorch")
+
+    class Exact(gpytorch.models.ExactGP):  # type: ignore[misc]
+        def __init__(self, x: torch.Tensor, y: torch.Tensor, likelihood: Any) -> None:
+            super().__init__(x, y, likelihood)
+            shape = x.shape[:1]
+            self.mean_module = gpytorch.means.ConstantMean(batch_shape=shape)
+            matern = gpytorch.kernels.MaternKernel(1.5, ard_num_dims=x.shape[-1], batch_shape=shape)
+            self.covar_module = gpytorch.kernels.ScaleKernel(matern, batch_shape=shape)
+
+        def forward(self, x: torch.Tensor) -> Any:
+            return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
+
     x = x.expand(y.shape[-1], *x.shape)
     likelihood = gpytorch.likelihoods.GaussianLikelihood(batch_shape=x.shape[:1])
-    model = _Exact(x, y.mT, likelihood).double()
+    model = Exact(x, y.mT, likelihood).double()
     likelihood.double()
     score = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model)
     optimiser = torch.optim.Adam(model.parameters(), lr=0.1)

@@ -5,17 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.calibration.calibrate import Calibration
-from ccnn_torch.calibration.calibrate import calibrate as _calibrate
-from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.calibrate import Calibration, calibrate as _calibrate
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.compensation import load_compensation
-from ccnn_torch.config.held_out import given_records, name_given
-from ccnn_torch.config.tree import config_from_keys
+from ccnn_torch.config.split import given_records, name_given
 from ccnn_torch.diagnosis.config import DiagnoseConfig
-from ccnn_torch.identification.config import make_identify_config
-from ccnn_torch.identification.identify import Identification
-from ccnn_torch.identification.identify import identify as _identify
+from ccnn_torch.identification.config import IdentifyConfig
+from ccnn_torch.identification.identify import Identification, identify as _identify
 from ccnn_torch.motion import MotionDiagnosis
 from ccnn_torch.motion.job import diagnosed
 from ccnn_torch.report.results.verify import VerifyResults
@@ -40,8 +37,8 @@ def calibrate(**keys: Any) -> Calibration:
     """
     given = given_records(keys.get("records"))
     if given is None:
-        return _calibrate(make_config(**keys))
-    config = make_config(**{**keys, "records": name_given(given)})
+        return _calibrate(RunConfig.from_keys(**keys))
+    config = RunConfig.from_keys(**{**keys, "records": name_given(given)})
     config = config.model_copy(update={"records": name_given(given)})
     return _calibrate(config, prepared=prepare(config, given))
 
@@ -59,7 +56,7 @@ def diagnose_motion(**keys: Any) -> MotionDiagnosis:
     Raises:
         InputError: a key, the logs or the model cannot be used; the sentence says what to change.
     """
-    return diagnosed(config_from_keys(DiagnoseConfig, keys))[0]
+    return diagnosed(DiagnoseConfig.from_keys(**keys))[0]
 
 
 def identify(**keys: Any) -> Identification:
@@ -78,8 +75,8 @@ def identify(**keys: Any) -> Identification:
     """
     given = given_records(keys.get("records"))
     if given is None:
-        return _identify(make_identify_config(**keys))
-    config = make_identify_config(**{**keys, "records": name_given(given)})
+        return _identify(IdentifyConfig.from_keys(**keys))
+    config = IdentifyConfig.from_keys(**{**keys, "records": name_given(given)})
     return _identify(config.model_copy(update={"records": name_given(given)}), given=given)
 
 

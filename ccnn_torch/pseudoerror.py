@@ -130,18 +130,3 @@ def _chunk(
     # Around the measured pose, so that a numerical forward map stays on its branch.
     remainder = mechanism.pose_error(measured, mechanism.forward_kinematics(ideal, parameters, guess=measured))
     return deviation, condition, remainder
-
-
-def pose_energy(mechanism: Mechanism, measured: Tensor, reference: Tensor, rotation_weight: float = 0.04) -> Tensor:
-    """Energy of a pose error, E = E_xyz + η E_rot (eq. 5), with the geodesic angle as E_rot.
-
-    Args:
-        mechanism: converts a pose to a frame.
-        measured, reference: `... x p` [SI].
-        rotation_weight: η [m/rad].
-
-    Returns:
-        `...` [m].
-    """
-    error = mechanism.pose_error(measured, reference)
-    return error.position if error.rotation is None else error.position + rotation_weight * error.rotation

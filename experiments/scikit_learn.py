@@ -3,7 +3,7 @@
 from sklearn.dummy import DummyRegressor
 from sklearn.model_selection import GridSearchCV, KFold, cross_val_score
 
-from ccnn_torch.simulation.cases import build_case
+from ccnn_torch.simulation.case_study import build_case
 from ccnn_torch.sklearn import BPLMRegressor, CCNNRegressor, ENNRegressor, GRNNRegressor
 
 case = build_case("tripod")

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.config import load_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, network_of
@@ -117,7 +117,7 @@ def test_a_repeat_that_fails_is_the_mean_and_does_not_spoil_the_others() -> None
 
 
 def test_on_case_one_it_is_far_below_the_constant_and_the_papers_own_figure() -> None:
-    config = load_config("experiments/tripod.yaml", ["seed=1000", "repeats=4"])
+    config = RunConfig.from_file("experiments/tripod.yaml", ["seed=1000", "repeats=4"])
     dataset = prepare(config).dataset
     learner = BPLM(BPLMSettings(restarts=3, iterations=25))
     data, scaling = dataset.scaled("fit", False, learner)

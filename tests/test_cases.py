@@ -8,7 +8,7 @@ import torch
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.pseudoerror import joint_deviations
-from ccnn_torch.simulation.cases import build_case
+from ccnn_torch.simulation.case_study import build_case
 
 
 def test_case_one_has_the_means_that_eq_17_gives() -> None:

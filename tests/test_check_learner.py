@@ -10,12 +10,12 @@ import torch
 from torch import Tensor, nn
 from toy import Descent
 
-from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.ccnn import CCNN
 from ccnn_torch.learners.constant import Constant
-from ccnn_torch.learners.enn import ENN, ENNSettings
+from ccnn_torch.learners.enn import ENN
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.learners.registry import make_learner
 from ccnn_torch.testing import check_learner
@@ -25,7 +25,6 @@ SMALL = {
     "hidden": (3, 2),
     "population": 8,
     "generations": 6,
-    "representatives": 1,
     "members": 1,
     "refinement_iterations": 0,
 }
@@ -33,7 +32,7 @@ SMALL = {
 
 FACTORIES: dict[str, Callable[[], Learner]] = {
     "ccnn": lambda: CCNN(CCNNSettings(**SMALL)),
-    "ccnn_without_bias": lambda: CCNN(CCNNSettings(**SMALL, bias=False, elites=3, crossover_kind="uniform")),
+    "ccnn_without_bias": lambda: CCNN(CCNNSettings(**SMALL, bias=False, elites=3)),
     "ccnn_refined": lambda: CCNN(
         CCNNSettings(**{**SMALL, "generations": 4, "refinement_iterations": 3, "refine_every": 2, "members": 2})
     ),
@@ -42,9 +41,7 @@ FACTORIES: dict[str, Callable[[], Learner]] = {
     "grnn": lambda: GRNN(GRNNSettings(iterations=5, candidates=6)),
     "grnn_some_rows": lambda: GRNN(GRNNSettings(iterations=4, candidates=6, queries=10, references=40)),
     "enn": lambda: ENN(ENNSettings(hidden=(3, 2), population=10, generations=6)),
-    "enn_without_bias": lambda: ENN(
-        ENNSettings(hidden=(4,), population=9, generations=5, bias=False, elites=3, crossover_kind="uniform")
-    ),
+    "enn_without_bias": lambda: ENN(ENNSettings(hidden=(4,), population=9, generations=5, bias=False, elites=3)),
     "constant": Constant,
     "descent": lambda: Descent(steps=8),
     "a user's": lambda: make_learner(EXAMPLE),

@@ -13,7 +13,7 @@ import jsonschema
 import pytest
 from ruamel.yaml import YAML
 
-from ccnn_torch.config.commands import config_schema, keys_by_section
+from ccnn_torch.config.keys import config_schema, keys_by_section
 
 Cli = Callable[..., tuple[int, str, str]]
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"

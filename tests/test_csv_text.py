@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from ccnn_torch.files.csv_text import csv_cell, csv_text
+from ccnn_torch.files.write import csv_cell, csv_text
 
 
 @pytest.mark.parametrize("text", ["=1+1", "+a", "-a", "@SUM(A1)", "\t=1", "\r=1", "-1-1", "+"])

@@ -26,8 +26,7 @@ from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, 
 from ccnn_torch.errors import InputError
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.report.screen import step_bar
-from ccnn_torch.simulation.job import simulate_records
-from ccnn_torch.simulation.outputs import write_simulated
+from ccnn_torch.simulation.job import simulate_records, write_simulated
 
 Cli = Callable[..., tuple[int, str, str]]
 
@@ -352,7 +351,7 @@ def test_a_terminal_shows_the_steps_and_the_time_left(rows: Path, monkeypatch: p
 
 def test_nothing_slow_is_loaded_that_a_diagnosis_does_not_need(rows: Path, tmp_path: Path) -> None:
     arm = Path(__file__).parent.parent / "experiments" / "data"
-    watched = "{'torch._dynamo', 'sympy', 'scipy', 'pint', 'gpytorch', 'torch.utils.tensorboard'}"
+    watched = "{'torch._dynamo', 'sympy', 'scipy', 'pint', 'torch.utils.tensorboard'}"
     program = f"""
 import sys
 from ccnn_torch.cli.application import app

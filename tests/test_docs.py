@@ -19,7 +19,7 @@ from ccnn_torch.mechanisms.registry import REGISTRY
 from ccnn_torch.motion.servo import KEYS
 
 ROOT = Path(__file__).parent.parent
-DIAGNOSIS = ROOT / "ccnn_torch" / "diagnosis"
+PACKAGE = ROOT / "ccnn_torch"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*/*.md"))]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 CONSTANTS = ROOT / "docs" / "explanation" / "diagnosis_constants.md"
@@ -44,8 +44,9 @@ def numeric_constants(path: Path) -> Iterator[tuple[str, str]]:
 def test_every_constant_of_the_diagnosis_is_in_the_table_with_its_value() -> None:
     table = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \| `([^`]+)` \| .+ \| .+ \|$", CONSTANTS.read_text(), re.M)
     code = {
-        (path.relative_to(DIAGNOSIS).with_suffix("").as_posix(), names, value)
-        for path in DIAGNOSIS.rglob("*.py")
+        (path.relative_to(PACKAGE).with_suffix("").as_posix(), names, value)
+        for folder in ("evidence", "diagnosis")
+        for path in (PACKAGE / folder).rglob("*.py")
         if "page" not in path.parts
         for names, value in numeric_constants(path)
     }

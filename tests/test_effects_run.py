@@ -17,7 +17,7 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
-from ccnn_torch.calibration.config import load_config, make_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
@@ -109,7 +109,7 @@ def test_held_out_rows_come_near_the_noise(played: Path) -> None:
 
 
 def test_held_out_rows_do_not_change_the_coefficients(played: Path, tmp_path: Path) -> None:
-    first = prepare(make_config(**keys(played)))
+    first = prepare(RunConfig.from_keys(**keys(played)))
     assert first.physics is not None
     lines = (played / "rows.csv").read_text(encoding="utf-8").splitlines()
     for row in first.dataset.splits[0].test.tolist():
@@ -117,14 +117,14 @@ def test_held_out_rows_do_not_change_the_coefficients(played: Path, tmp_path: Pa
         cells[2] = str(float(cells[2]) + 1e-3)
         lines[row + 1] = ",".join(cells)
     (tmp_path / "rows.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    other = prepare(make_config(**keys(played, records=str(tmp_path / "rows.csv"), split={"kind": "random"})))
+    other = prepare(RunConfig.from_keys(**keys(played, records=str(tmp_path / "rows.csv"), split={"kind": "random"})))
     assert other.physics is not None
     assert torch.equal(first.dataset.splits[0].test, other.dataset.splits[0].test)
     assert first.physics.block() == other.physics.block()
 
 
 def test_the_network_learns_what_is_left_exactly(played: Path) -> None:
-    found = prepare(make_config(**keys(played)))
+    found = prepare(RunConfig.from_keys(**keys(played)))
     assert found.physics is not None
     usable = found.dataset.usable[0]
     reached = found.physics.poses(0, found.joints[0] + found.dataset.deviation[0])
@@ -132,7 +132,7 @@ def test_the_network_learns_what_is_left_exactly(played: Path) -> None:
 
 
 def test_with_identified_geometry_beside_it(played: Path) -> None:
-    found = prepare(make_config(**keys(played, geometry="identify")))
+    found = prepare(RunConfig.from_keys(**keys(played, geometry="identify")))
     assert found.physics is not None
     left, usable = found.dataset.deviation, found.dataset.usable[0]
     assert not torch.equal(found.physics.values[0, 0], found.mechanism.nominal)
@@ -274,36 +274,36 @@ def test_what_does_not_fit_is_one_sentence(
     played: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None], sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence) as caught:
-        prepare(make_config(**keys(played, effects=edited(played, tmp_path, change))))
+        prepare(RunConfig.from_keys(**keys(played, effects=edited(played, tmp_path, change))))
     assert "\n" not in str(caught.value) and "diagnosis.json" in str(caught.value)
 
 
 def test_keys_that_do_not_go_together(played: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="effects: a case is there to compare learners"):
-        make_config(case="tripod", effects="from:x.json")
+        RunConfig.from_keys(case="tripod", effects="from:x.json")
     with pytest.raises(InputError, match=r"effects: is '.*diagnosis\.json'; write effects=from:"):
-        make_config(**keys(played, effects="found/diagnosis.json"))
+        RunConfig.from_keys(**keys(played, effects="found/diagnosis.json"))
     with pytest.raises(InputError, match=r"rows\.csv: compliance of .* a column of the load.*not among covariates"):
-        prepare(make_config(**keys(played, covariates=["time"])))
+        prepare(RunConfig.from_keys(**keys(played, covariates=["time"])))
     table = read_table(played / "rows.csv")
     kept = {f"{n}[{table.units[n]}]": table.raw(n) for n in table.names if not n.startswith("load_")}
     write_table(tmp_path / "unloaded.csv", kept)
     sentence = r"unloaded\.csv: compliance of .*diagnosis\.json needs .*load_x.* there is no such column; add it"
     with pytest.raises(InputError, match=sentence):
-        prepare(make_config(**keys(played, records=str(tmp_path / "unloaded.csv"))))
+        prepare(RunConfig.from_keys(**keys(played, records=str(tmp_path / "unloaded.csv"))))
     with pytest.raises(InputError, match="there is no such file"):
-        prepare(make_config(**keys(played, effects="from:nowhere.json")))
+        prepare(RunConfig.from_keys(**keys(played, effects="from:nowhere.json")))
 
 
 def test_paths_start_where_the_key_stands(played: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     path = played / "config.yaml"
-    assert load_config(path).effects == f"from:{played / 'found' / 'diagnosis.json'}"
-    assert load_config(path, ["effects=from:d.json"]).effects == f"from:{tmp_path / 'd.json'}"
+    assert RunConfig.from_file(path).effects == f"from:{played / 'found' / 'diagnosis.json'}"
+    assert RunConfig.from_file(path, ["effects=from:d.json"]).effects == f"from:{tmp_path / 'd.json'}"
 
 
 def test_a_lag_is_left_out_and_said(played: Path) -> None:
-    config = make_config(**keys(played, effects="none"))
+    config = RunConfig.from_keys(**keys(played, effects="none"))
     rows = prepare(config)
     names = [c.name for c in rows.covariate_coordinates]
     covariates = dict(zip(names, rows.covariates[0].unbind(-1), strict=True))
@@ -321,7 +321,7 @@ def test_names_beside_something_outside_are_taken_and_the_rest_is_said(played: P
     told["verdict"] |= {"outside_library": True, "driver": "workspace"}
     (tmp_path / "d.json").write_text(json.dumps(told), encoding="utf-8")
     verdict = read_verdict(tmp_path / "d.json", "five_bar", ["q1", "q2"])
-    rows = prepare(make_config(**keys(played, effects="none")))
+    rows = prepare(RunConfig.from_keys(**keys(played, effects="none")))
     covariates = dict(zip([c.name for c in rows.covariate_coordinates], rows.covariates[0].unbind(-1), strict=True))
     situation = Situation(rows.mechanism, rows.joints[0], covariates, default_gravity(rows.mechanism))
     known, notes = verdict.on(situation)
@@ -331,14 +331,25 @@ def test_names_beside_something_outside_are_taken_and_the_rest_is_said(played: P
 
 def test_a_gross_outlier_is_not_learned_from_and_is_judged_where_it_is_held_out(played: Path, tmp_path: Path) -> None:
     table = read_table(played / "rows.csv")
-    first = prepare(make_config(**keys(played)))
+    first = prepare(RunConfig.from_keys(**keys(played)))
     split = first.dataset.splits[0]
     wrong = [int(split.train[0]), int(split.test[0])]
     columns = {f"{n}[{table.units[n]}]": table.raw(n).copy() for n in table.names}
     columns["x[m]"][wrong] += 5e-3
     write_table(tmp_path / "rows.csv", columns)
-    rows = prepare(make_config(**keys(played, records=str(tmp_path / "rows.csv"))))
+    rows = prepare(RunConfig.from_keys(**keys(played, records=str(tmp_path / "rows.csv"))))
     flagged = torch.nonzero(rows.pseudoerror.reasons["outlier"][0]).squeeze(-1).tolist()
     assert flagged == wrong[:1]
     assert not bool(rows.dataset.usable[0, wrong[0]]) and bool(rows.dataset.usable[0, wrong[1]])
     assert any("misses them by more than ten times the usual" in note for note in rows.notes)
+
+
+def test_rows_that_no_machine_takes_are_one_sentence(tmp_path: Path) -> None:
+    """Joints in another unit: the search for effects has no row, either."""
+    tripod = load_mechanism("tripod")
+    pose = tripod.sample_workspace(40, torch.Generator().manual_seed(1))
+    joints = tripod.solve_inverse(pose) * torch.tensor([1e-20, 1.0, 1.0], dtype=torch.float64)
+    told = [*zip(tripod.joints, joints.mT, strict=True), *zip(tripod.pose, pose.mT, strict=True)]
+    write_table(tmp_path / "rows.csv", {c.header: values.numpy() for c, values in told})
+    with pytest.raises(InputError, match="no usable row is left in the train part of the split"):
+        calibrate(records=str(tmp_path / "rows.csv"), mechanism="tripod", methods=["constant"], geometry="none")

@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 
 from ccnn_torch.cli.application import app
 from ccnn_torch.engine import Job, check_engine, run_jobs
+from ccnn_torch.engine.engine import open_engine
 from ccnn_torch.errors import InputError, MethodFailedError
 
 distributed = pytest.importorskip("distributed", reason="needs pip install 'ccnn-torch[cluster]'")
@@ -70,6 +71,13 @@ def squares(folder: Path, count: int, seconds: float = 0.0) -> list[Job]:
 
 def found(jobs: list[Job]) -> list[int]:
     return [int(job.result.read_text().split()[0]) for job in jobs]
+
+
+@pytest.mark.parametrize(("engine", "module"), [("processes", "joblib.externals.loky"), ("dask", "distributed")])
+def test_what_is_not_installed_is_one_sentence(engine: str, module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=f"needs {module.partition('.')[0]}: pip install 'ccnn-torch"):
+        open_engine(engine).__enter__()
 
 
 def test_one_failure_keeps_no_other_job_from_its_result(tmp_path: Path) -> None:

@@ -23,8 +23,7 @@ from ccnn_torch.errors import InputError, WriteError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.records import write_table
 from ccnn_torch.report.event_file import EventFile
-from ccnn_torch.run_folder.folder import RunFolder
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import RunFolder, locked
 
 ROOT = Path(__file__).parent.parent
 Cli = Callable[..., tuple[int, str, str]]
@@ -139,7 +138,7 @@ def test_curves_end_where_the_disk_is_full_and_the_run_goes_on(tmp_path: Path) -
 HOLD = """
 import os, signal, sys
 from pathlib import Path
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import locked
 with locked(Path(sys.argv[1])):
     sys.stdout.write("held")
     sys.stdout.flush()

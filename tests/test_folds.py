@@ -6,8 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from test_uncertainty import linear_dataset
 from toy import Descent
 

@@ -11,7 +11,8 @@ from fitted import fitted_geometry
 from mechanisms.catalogue import make
 
 from ccnn_torch import calibrate
-from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.calibration.geometry.choice import Candidate, simplest_of_best
 from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.mechanisms import fit_frames, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation
@@ -31,7 +32,7 @@ def _prepared(folder: Path, geometry_error: float, wave: float, **keys: object) 
     pose = pose + 5e-6 * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
     names = [c.header for c in (*tripod.joints, *tripod.pose)]
     write_table(folder / "rows.csv", dict(zip(names, torch.cat([joints, pose], -1).mT.numpy(), strict=True)))
-    return prepare(make_config(records=str(folder / "rows.csv"), mechanism="tripod", **keys))
+    return prepare(RunConfig.from_keys(records=str(folder / "rows.csv"), mechanism="tripod", **keys))
 
 
 def test_wrong_parameters_alone_need_no_learner(tmp_path: Path) -> None:
@@ -61,7 +62,7 @@ def test_held_out_rows_do_not_choose(tmp_path: Path) -> None:
         cells[3] = repr(float(cells[3]) + 1e-3)
         lines[row + 1] = ",".join(cells)
     (tmp_path / "rows.csv").write_text("\n".join(lines))
-    assert prepare(make_config(records=str(tmp_path / "rows.csv"), mechanism="tripod")).choice == first
+    assert prepare(RunConfig.from_keys(records=str(tmp_path / "rows.csv"), mechanism="tripod")).choice == first
 
 
 def test_an_explicit_word_is_kept(tmp_path: Path) -> None:
@@ -98,3 +99,12 @@ def test_positions_alone_turn_no_joint_that_they_do_not_show(name: str, tmp_path
         return math.sqrt(float(left.square().sum(-1).mean()))
 
     assert turned(links) < 1.1 * turned(frames)
+
+
+@pytest.mark.parametrize(("gains", "learner"), [((1, 3, -1, 2, 0), False), ((2, 3, 1, 2, 2), True)])
+def test_a_larger_model_has_to_be_better_by_two_standard_errors(gains: tuple[float, ...], learner: bool) -> None:
+    """Gains of 1.4 and 6 standard errors of the five folds' differences."""
+    simple, larger = Candidate(True, False, False), Candidate(True, False, True)
+    before = torch.full((5,), 100.0, dtype=torch.float64)
+    found = simplest_of_best({simple: before, larger: before - torch.tensor(gains)}, "")
+    assert found.identify and (found.method == "gp") is learner

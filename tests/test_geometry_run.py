@@ -11,7 +11,7 @@ from fitted import fitted_geometry
 from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
-from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import start_run
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli.application import app
@@ -89,8 +89,8 @@ def test_commands_of_a_parallel_mechanism(tmp_path: Path) -> None:
 def test_the_remainder_is_what_the_identified_machine_leaves(tmp_path: Path) -> None:
     truth = tripod_records(tmp_path / "rows.csv")
     keys = {"records": str(tmp_path / "rows.csv"), "mechanism": "tripod", "methods": ["constant"], "effects": "none"}
-    plain = prepare(make_config(**keys, geometry="none"))
-    known = prepare(make_config(**keys, geometry="identify", repeats=2))
+    plain = prepare(RunConfig.from_keys(**keys, geometry="none"))
+    known = prepare(RunConfig.from_keys(**keys, geometry="identify", repeats=2))
     assert plain.physics is None and known.physics is not None
     torch.testing.assert_close(known.total[0], plain.dataset.deviation[0], rtol=0, atol=0)
     left = known.dataset.deviation.square().mean().sqrt()
@@ -105,7 +105,9 @@ def test_the_remainder_is_what_the_identified_machine_leaves(tmp_path: Path) -> 
 def test_before_in_the_figures_is_before_the_geometry_too(tmp_path: Path) -> None:
     tripod_records(tmp_path / "rows.csv")
     keys = {"records": str(tmp_path / "rows.csv"), "mechanism": "tripod", "geometry": "identify"}
-    config = make_config(**keys, methods=["constant"], out=str(tmp_path / "r"), save_models=False, save_report=False)
+    config = RunConfig.from_keys(
+        **keys, methods=["constant"], out=str(tmp_path / "r"), save_models=False, save_report=False
+    )
     start_run(config, quiet=True)
     arrays = load_arrays(tmp_path / "r")
     tripod, names = load_mechanism("tripod"), [c.header for c in load_mechanism("tripod").pose]
@@ -133,9 +135,9 @@ def test_held_out_rows_do_not_change_the_geometry() -> None:
 
 def test_where_geometry_has_no_place() -> None:
     with pytest.raises(InputError, match="geometry: a case is there to compare learners"):
-        make_config(case="tripod", geometry="identify")
+        RunConfig.from_keys(case="tripod", geometry="identify")
     with pytest.raises(InputError, match="geometry"):
-        make_config(**UR10, geometry="identfy")
+        RunConfig.from_keys(**UR10, geometry="identfy")
 
 
 def test_an_arm_with_frames_per_group_is_refused(tmp_path: Path) -> None:
@@ -143,4 +145,4 @@ def test_an_arm_with_frames_per_group_is_refused(tmp_path: Path) -> None:
     (tmp_path / "arm.yaml").write_text(text + "\nframe_per: [goal_x]\n")
     keys = {**UR10, "mechanism": str(tmp_path / "arm.yaml"), "geometry": "identify"}
     with pytest.raises(InputError, match=r"geometry: .* has frames per group"):
-        prepare(make_config(**keys))
+        prepare(RunConfig.from_keys(**keys))

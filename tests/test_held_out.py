@@ -14,10 +14,10 @@ import torch
 from test_geometry_run import tripod_records
 
 from ccnn_torch import calibrate, diagnose, identify, load_mechanism, load_records
-from ccnn_torch.calibration.config import load_config, make_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import resume_run
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.config import make_identify_config
+from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.job import resume_identification
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.report.json_files import plain
@@ -70,12 +70,12 @@ def test_a_file_of_test_rows_from_config_to_results_and_resumed(folder: Path, cl
 @pytest.mark.parametrize("text", ["day1.csv,day2.csv", "[day1.csv, day2.csv]", "['day1.csv','day2.csv']"])
 def test_files_on_the_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.chdir(folder)
-    config = load_config("run.yaml", [f"records={text}", "split.test=later.csv"])
+    config = RunConfig.from_file("run.yaml", [f"records={text}", "split.test=later.csv"])
     assert config.records == [str(folder / "day1.csv"), str(folder / "day2.csv")]
     assert config.split.test == str(folder / "later.csv")
-    assert load_config("run.yaml", ["records=day1.csv", "split.test=0.4"]).records == str(folder / "day1.csv")
+    assert RunConfig.from_file("run.yaml", ["records=day1.csv", "split.test=0.4"]).records == str(folder / "day1.csv")
     (folder / "a,b.csv").write_text("x")
-    assert load_config("run.yaml", ["records=a,b.csv"]).records == str(folder / "a,b.csv")
+    assert RunConfig.from_file("run.yaml", ["records=a,b.csv"]).records == str(folder / "a,b.csv")
 
 
 @pytest.mark.parametrize(
@@ -105,9 +105,9 @@ def test_what_cannot_be_held_out(
 def test_a_case_reads_no_file() -> None:
     for keys in ({"split": {"test": "a.csv"}}, {"columns": {"A": "q1[m]"}}):
         with pytest.raises(InputError, match="a case"):
-            make_config(case="tripod", **keys)
+            RunConfig.from_keys(case="tripod", **keys)
         with pytest.raises(InputError, match="simulated machines read no file"):
-            make_identify_config(mechanism="tripod", simulate={}, **keys)
+            IdentifyConfig.from_keys(mechanism="tripod", simulate={}, **keys)
 
 
 def test_identify_reads_records_alike(folder: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.errors import InputError
 from ccnn_torch.simulation.machines.arm import ArmStructure
@@ -31,7 +31,7 @@ def machine(name: str, cause: str = "mixed", **keys: Any) -> RealisticMachine:
 
 def prepared(name: str, cause: str = "mixed", **keys: Any) -> Prepared:
     about = {"machine": name, "cause": cause, "rows": 40}
-    return prepare(make_config(case="realistic", realistic=about | keys.pop("realistic", {}), **keys))
+    return prepare(RunConfig.from_keys(case="realistic", realistic=about | keys.pop("realistic", {}), **keys))
 
 
 @pytest.mark.parametrize("name", MACHINES)
@@ -253,6 +253,6 @@ def test_covariates_can_be_chosen_or_left_out() -> None:
 
 def test_the_section_belongs_to_its_case() -> None:
     with pytest.raises(InputError, match="these keys need case=realistic"):
-        make_config(case="tripod", realistic={"rows": 60})
+        RunConfig.from_keys(case="tripod", realistic={"rows": 60})
     with pytest.raises(InputError, match="random poses"):
-        make_config(case="realistic", order="raster")
+        RunConfig.from_keys(case="realistic", order="raster")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from ccnn_torch.calibration.config import load_config
-from ccnn_torch.cli.completion import MECHANISMS, complete_mechanism
+from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.cli.options import MECHANISMS, complete_mechanism
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.registry import REGISTRY
@@ -104,7 +104,7 @@ def test_a_german_export_runs_without_a_word(tmp_path: Path, cli: Cli) -> None:
     beside = [np.arange(40), generator.normal(22, 1, 40), *generator.choice([-1, 1], (3, 40)), np.arange(40)]
     records = write(tmp_path / "messung.csv", headers, np.column_stack([delta(), *beside]), ";")
     assert cli("new", records, "--mechanism", "delta", "--out", tmp_path / "c.yaml")[0] == 0
-    columns = load_config(tmp_path / "c.yaml").columns
+    columns = RunConfig.from_file(tmp_path / "c.yaml").columns
     assert columns["Zeit[Min]"] == "time[Min]" and columns["Anfahrt A3"] == "direction3[1]"
     assert columns["Hallentemp.[°C]"] == "temperature[°C]" and "Richtung 1" not in columns
     code, _, err = cli("run", tmp_path / "c.yaml", "methods=[constant]", "geometry=none", "save_models=false",
@@ -122,7 +122,7 @@ def test_an_arms_controller_names_and_repeated_targets(tmp_path: Path) -> None:
     records = write(tmp_path / "kuka.csv", headers, arm(60, places=15), separator=";")
     text, ready = starter_config(records, tmp_path / "kuka.yaml", mechanism=str(ARM))
     (tmp_path / "kuka.yaml").write_text(text, encoding="utf-8")
-    config = load_config(tmp_path / "kuka.yaml")
+    config = RunConfig.from_file(tmp_path / "kuka.yaml")
     assert ready and config.columns["A1[deg]"] == "q1[deg]" and config.columns["C[deg]"] == "kuka_c[deg]"
     assert config.split.kind == "group" and config.split.by == ["position:5mm"] and "KUKA" in text
     once = write(tmp_path / "once.csv", headers, arm(60))
@@ -140,7 +140,7 @@ def test_tables_without_joints_or_with_strange_text(tmp_path: Path) -> None:
     values = np.random.default_rng(0).uniform(0.1, 1, (30, 6))
     text, _ = starter_config(write(tmp_path / "c.csv", headers, values), tmp_path / "c.yaml")
     (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
-    config = load_config(tmp_path / "c.yaml")
+    config = RunConfig.from_file(tmp_path / "c.yaml")
     assert config.out is None and config.mechanism == "five_bar"
 
 

@@ -104,7 +104,6 @@ def test_si_in_the_order_of_the_mechanism(tmp_path: Path) -> None:
     np.testing.assert_allclose(records.positions.numpy(), expected[:, :1], rtol=1e-14)
     np.testing.assert_allclose(records.covariates.numpy(), columns["temperature[degC]"][:, None] + 273.15, rtol=1e-14)
     assert records.covariate_coordinates == (Coordinate("temperature", "K"),)
-    assert records.joint_units == {"q1": "mm", "q2": "deg"} and records.pose_units == {"y": "mm", "phi": "rad"}
     assert set(records.columns) == {"temperature", "goal_y", "row"}
     np.testing.assert_allclose(records.columns["goal_y"], columns["goal_y[mm]"] * 1e-3, rtol=1e-14)
     assert any("goal_y, row" in note for note in records.notes)

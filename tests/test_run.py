@@ -22,11 +22,11 @@ from safetensors.torch import load_file
 from test_cli import tripod_records
 
 from ccnn_torch.calibration.calibrate import calibrate
-from ccnn_torch.calibration.config import RunConfig, load_config, make_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import resume_run, start_run
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml
-from ccnn_torch.identification.config import load_identify_config
+from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.study.suite_config import load_suite
@@ -65,7 +65,7 @@ def short(**keys: Any) -> RunConfig:
         "training": {"early_stop": False, "checkpoint_every": 4},
         "ccnn": SHORT,
     }
-    return make_config(**(base | keys))
+    return RunConfig.from_keys(**(base | keys))
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +249,7 @@ def test_a_killed_run_resumes_to_identical_results(cli: Cli, tmp_path: Path, del
     keys += ["save_models=false", "save_report=false"]
     keys += more
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    start_run(load_config(TRIPOD, [*keys, f"out={whole}"]), quiet=True)
+    start_run(RunConfig.from_file(TRIPOD, [*keys, f"out={whole}"]), quiet=True)
     code, _ = stopped(killed, keys, delay, signal.SIGKILL)
     assert code == -signal.SIGKILL
     assert cli("run", "--resume", killed)[0] == 0
@@ -270,10 +270,10 @@ def test_every_key_of_the_shipped_configs_is_known() -> None:
             assert load_suite(path).name == path.stem
             continue
         if {"simulate", "constraint"} & set(read_yaml(path)):
-            assert load_identify_config(path).name == path.stem
+            assert IdentifyConfig.from_file(path).name == path.stem
             continue
         overrides = ["records=x.csv", "mechanism=tripod"] if path.name == "records.yaml" else []
-        assert load_config(path, overrides).name == path.stem
+        assert RunConfig.from_file(path, overrides).name == path.stem
 
 
 def test_shuffled_order_leaves_nothing_to_learn() -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from ccnn_torch.diagnosis.config import load_diagnose_config
-from ccnn_torch.identification.config import load_identify_config
-from ccnn_torch.planning.config import load_plan_config
+from ccnn_torch.diagnosis.config import DiagnoseConfig
+from ccnn_torch.identification.config import IdentifyConfig
+from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.records import read_table
-from ccnn_torch.verification.config import load_verify_config
+from ccnn_torch.verification.config import VerifyConfig
 
 Cli = Callable[..., tuple[int, str, str]]
 PLANNED = ("candidates=300", "--quiet", "--poses", 8, "--out")
@@ -40,7 +40,7 @@ def test_the_config_of_new_goes_into_every_command(config: Path, tmp_path: Path,
         ("identify", "--config", config, f"--out={tmp_path / 'j'}", "--quiet", "save_report=false"),
         ("run", "--config", config, "--out", tmp_path / "r", "methods=[constant]", "save_report=false", "--quiet"),
         ("plan", config, *PLANNED, tmp_path / "p.csv"),
-        ("plan", "--config", config, "--records", tmp_path / "rows.csv", *PLANNED, tmp_path / "p.csv"),
+        ("plan", "--config", config, *PLANNED, tmp_path / "p.csv"),
         ("verify", tmp_path / "i" / "identified.yaml", "--config", config, "--out", tmp_path / "v"),
     ):
         code, out, err = cli(*words)
@@ -68,12 +68,18 @@ def test_options_stand_for_keys(config: Path, tmp_path: Path, cli: Cli) -> None:
         (("verify", model, "--out", tmp_path / "v"), "records: are missing; give RECORDS.csv, --records"),
         (("plan", "--poses", 3, "--out", tmp_path / "p.csv"), "mechanism: is missing; give --mechanism"),
         (("check", config, "--config", config), "two configs are given"),
+        (
+            ("plan", "--records", rows, "--mechanism", "five_bar", *PLANNED, tmp_path / "p.csv"),
+            "No such option: --records",
+        ),
     ):
         code, _, err = cli(*words)
         assert code == 2 and sentence in err and err.count("\n") == 1
 
 
-@pytest.mark.parametrize("load", [load_diagnose_config, load_identify_config, load_plan_config, load_verify_config])
+@pytest.mark.parametrize(
+    "load", [DiagnoseConfig.from_file, IdentifyConfig.from_file, PlanConfig.from_file, VerifyConfig.from_file]
+)
 def test_what_no_command_knows_is_refused_with_the_nearest_key(
     load: Callable[..., object], config: Path, tmp_path: Path
 ) -> None:

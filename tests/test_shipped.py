@@ -16,7 +16,7 @@ from frozen import frozen
 
 from ccnn_torch.compensation import load_model
 from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.simulation.cases import build_case
+from ccnn_torch.simulation.case_study import build_case
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "ccnn_torch"
@@ -26,10 +26,10 @@ SHIPPED = ROOT / "checkpoints" / "tripod"
 # A module may import those that stand before it; a folder stands where its longest entry is.
 FLOORS = [
     [
+        "doors",
         "version",
         "errors",
         "coordinates",
-        "unit_words",
         "units",
         "display",
         "spelling",
@@ -41,6 +41,7 @@ FLOORS = [
     ["mechanisms", "pseudoerror"],
     ["learners/protocol", "training", "evolution", "learners", "effects"],
     ["identification/problems", "identification/solvers", "identification/identifiability", "identification/__init__"],
+    ["evidence"],
     ["compensation"],
     ["diagnosis"],
     ["motion"],

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from ccnn_torch.config.keys import list_keys
 from ccnn_torch.effects import EFFECTS, Situation, default_gravity, make_effect, pose_residual, signature
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records, read_table
-from ccnn_torch.simulation.config import SimulateConfig, describe_simulate_keys, load_simulate_config
+from ccnn_torch.simulation.config import SimulateConfig
 from ccnn_torch.simulation.job import simulate_records
 
 Cli = Callable[..., tuple[int, str, str]]
@@ -201,13 +202,13 @@ def test_the_help_and_the_page_name_every_effect_and_key(cli: Cli, tmp_path: Pat
     page = (ROOT / "docs" / "how_to" / "effects.md").read_text()
     for name in EFFECTS:
         assert name in told and f"| `{name}` | " in page and make_effect(name).description in page
-    for key, default, description in describe_simulate_keys():
+    for key, default, description in list_keys(SimulateConfig):
         assert key in told and f"| `{key}` | `{default}` | {description} |" in page
     example = (ROOT / "experiments" / "my_effect.py").read_text()
     assert f"```python\n{example}```" in page
     config = tmp_path / "s.yaml"
     config.write_text("covariates: [time, direction*]\nload: 10\n")
-    assert load_simulate_config(config).load == 10.0 and load_simulate_config(None) == SimulateConfig()
+    assert SimulateConfig.from_file(config).load == 10.0 and SimulateConfig.from_file(None) == SimulateConfig()
 
 
 def test_python_takes_a_mechanism_and_refuses_an_unknown_coordinate() -> None:

@@ -13,7 +13,7 @@ import pytest
 from frozen import frozen
 from rich.console import Console
 
-from ccnn_torch.calibration.config import RunConfig, dump_config, make_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import plain
@@ -54,7 +54,7 @@ def test_a_suite_runs_its_cases_and_goes_on_where_it_was_stopped(tmp_path: Path)
     before = stamps(kept)
     # As a run that was killed before its first checkpoint leaves it.
     stopped.mkdir()
-    (stopped / "config.yaml").write_text(dump_config(suite.runs["reach"]))
+    (stopped / "config.yaml").write_text(suite.runs["reach"].to_yaml())
     path = run_suite(suite, quiet=True)
     assert stamps(kept) == before
     comparison = json.loads(path.read_text())
@@ -153,7 +153,7 @@ def results(floor: list[float] | None, **errors: list[float] | None) -> RunResul
 
 
 def split(kind: str) -> RunConfig:
-    return make_config(case="tripod", split={"kind": kind})
+    return RunConfig.from_keys(case="tripod", split={"kind": kind})
 
 
 def test_best_tied_and_close_are_what_their_definitions_say(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 from frozen import frozen
 
 from ccnn_torch import api
-from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import resume_run, start_run
 from ccnn_torch.calibration.rows import memory
 from ccnn_torch.compensation import load_model
@@ -130,8 +130,8 @@ def assert_near(one: Any, other: Any) -> None:
 def test_blocks_of_repeats_give_the_figures_of_all_at_once(tmp_path: Path) -> None:
     keys: dict[str, Any] = {"case": "tripod", "methods": ["bp_lm"], "bp_lm": QUICK, "repeats": 5, "seed": 3}
     keys |= {"save_report": False}
-    whole = start_run(make_config(**keys, save_models=False, out=str(tmp_path / "whole")), quiet=True)
-    parts = start_run(make_config(**keys, block=2, out=str(tmp_path / "parts")), quiet=True)
+    whole = start_run(RunConfig.from_keys(**keys, save_models=False, out=str(tmp_path / "whole")), quiet=True)
+    parts = start_run(RunConfig.from_keys(**keys, block=2, out=str(tmp_path / "parts")), quiet=True)
     one, other = without_times(whole.results), without_times(parts.results)
     jsonschema.validate(json.loads(parts.results.read_text()), frozen("results"))
     assert {p.name for p in (parts.path / "blocks").iterdir()} == {"0", "2", "4"}
@@ -153,7 +153,8 @@ def test_blocks_of_repeats_give_the_figures_of_all_at_once(tmp_path: Path) -> No
     assert {key: again[key] for key in other} == other
     with pytest.raises(InputError, match="methods=auto chooses a method for all repeats together"):
         start_run(
-            make_config(case="tripod", methods=["auto"], repeats=2, block=1, out=str(tmp_path / "auto")), quiet=True
+            RunConfig.from_keys(case="tripod", methods=["auto"], repeats=2, block=1, out=str(tmp_path / "auto")),
+            quiet=True,
         )
 
 
@@ -162,8 +163,10 @@ def test_repeats_that_memory_does_not_hold_run_in_blocks_or_not_at_all(
 ) -> None:
     keys: dict[str, Any] = {"case": "tripod", "methods": ["constant", "bp_lm"], "bp_lm": QUICK}
     keys |= {"save_models": False, "save_report": False}
-    each = memory.memory_of_run(make_config(**keys), 125, 3)
-    out = start_run(make_config(**keys, repeats=5, max_bytes=2 * each, out=str(tmp_path / "run")), quiet=True).path
+    each = memory.memory_of_run(RunConfig.from_keys(**keys), 125, 3)
+    out = start_run(
+        RunConfig.from_keys(**keys, repeats=5, max_bytes=2 * each, out=str(tmp_path / "run")), quiet=True
+    ).path
     assert {p.name for p in (out / "blocks").iterdir()} == {"0", "2", "4"}
     results = json.loads((out / "results.json").read_text())
     assert len(results["constant"]["test"]["all"]["mse"]["values"]) == 5
@@ -173,14 +176,14 @@ def test_repeats_that_memory_does_not_hold_run_in_blocks_or_not_at_all(
     # What is free is a quarter's limit: three repeats at once of ten.
     monkeypatch.setattr(memory, "free_memory", lambda: 12 * each)
     with pytest.raises(memory.TooManyRepeatsError) as told:
-        memory.check_memory(make_config(**keys, repeats=10), 125, 3)
+        memory.check_memory(RunConfig.from_keys(**keys, repeats=10), 125, 3)
     assert told.value.block == 3
-    assert memory.check_memory(make_config(**keys, repeats=3), 125, 3) == []
+    assert memory.check_memory(RunConfig.from_keys(**keys, repeats=3), 125, 3) == []
     # One repeat may take what is free, and is told when it is near.
     monkeypatch.setattr(memory, "free_memory", lambda: each + 1)
-    assert "stopped by the system" in memory.check_memory(make_config(**keys), 125, 3)[0]
+    assert "stopped by the system" in memory.check_memory(RunConfig.from_keys(**keys), 125, 3)[0]
     for given in ({"max_bytes": each - 1}, {"repeats": 1000, "max_bytes": each}):
         needed = f"{each * given.get('repeats', 1):,} bytes"
         with pytest.raises(InputError, match=needed) as refused:
-            start_run(make_config(**keys, **given, out=str(tmp_path / "no")), quiet=True)
+            start_run(RunConfig.from_keys(**keys, **given, out=str(tmp_path / "no")), quiet=True)
         assert not isinstance(refused.value, memory.TooManyRepeatsError) and not (tmp_path / "no").exists()

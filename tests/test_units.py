@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pint
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy import constants
 
 from ccnn_torch.errors import InputError

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ccnn_torch.calibration.config import RunConfig, dump_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.page.tables import write_tables
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
@@ -119,7 +119,7 @@ def _export(config: RunConfig, folder: RunFolder, again: Callable[[Path], object
     """Write the model files of a finished block; its training is in its checkpoints."""
     if (folder.path / "card.json").is_file():
         return
-    folder.write("config.yaml", dump_config(config.model_copy(update={"save_models": True}), folder.path))
+    folder.write("config.yaml", config.model_copy(update={"save_models": True}).to_yaml(folder.path))
     folder.results.unlink()
     again(folder.path)
 

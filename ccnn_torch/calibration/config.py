@@ -6,30 +6,23 @@ Relative paths in a config file start from the file's folder, those on the comma
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
-from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.split import SplitConfig
 from ccnn_torch.config.tree import (
     Columns,
     Files,
+    JobConfig,
     JointMap,
     Names,
     Section,
-    config_from_file,
-    config_from_keys,
-    config_from_options,
-    written,
 )
 from ccnn_torch.effects import EFFECTS
 from ccnn_torch.engine import Engine
-from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners.bp_lm import BPLMSettings
-from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.spelling import nearest
@@ -137,8 +130,10 @@ def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
     return methods
 
 
-class RunConfig(_Part):
+class RunConfig(JobConfig):
     """A run: data, split, methods and their settings."""
+
+    model_config = _Part.model_config
 
     name: str = Field(default="run", min_length=1, description="name of the run; default: the config file's name")
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the first repeat; repeat k has seed + k")
@@ -330,31 +325,6 @@ class RunConfig(_Part):
         return dataclasses.asdict(section) if section is not None else {}
 
 
-def load_config(path: str | Path | None, overrides: Iterable[str] = ()) -> RunConfig:
-    """Read a config file and put overrides ``key.sub=value`` over it.
-
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    if path is None:
-        return config_from_options(RunConfig, None, overrides)
-    return config_from_file(RunConfig, path, overrides)
-
-
-def make_config(**keys: Any) -> RunConfig:
-    """A config from keys, e.g. ``make_config(case="tripod", ccnn={"generations": 60})``; paths from the current folder.
-
-    Raises:
-        InputError: keys are wrong: one line that names them all.
-    """
-    return config_from_keys(RunConfig, keys)
-
-
-def dump_config(config: RunConfig, folder: Path | None = None) -> str:
-    """The resolved config as YAML, its paths relative to `folder` if given; `load_config` of it gives an equal one."""
-    return written(config, folder)
-
-
 def method_names(config: RunConfig, default: str = "ccnn") -> list[str]:
     """The methods to train: ``all`` and ``auto`` spelt out; `default` where the config names none and sets no ccnn."""
     if config.methods is None:
@@ -364,14 +334,3 @@ def method_names(config: RunConfig, default: str = "ccnn") -> list[str]:
     if config.methods == ["auto"]:
         return list(config.auto.methods)
     return list(config.methods)
-
-
-def describe_keys() -> list[tuple[str, str, str]]:
-    """Every key, dotted, with its default and what it means."""
-    return list(list_keys(RunConfig))
-
-
-def key_table() -> str:
-    """`describe_keys` as a Markdown table."""
-    rows = [f"| `{key}` | `{default}` | {description} |" for key, default, description in describe_keys()]
-    return "\n".join(["| key | default | meaning |", "| --- | --- | --- |", *rows]) + "\n"

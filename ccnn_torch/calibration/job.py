@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ccnn_torch.calibration.blocks import blocks_of, write_blocks
 from ccnn_torch.calibration.calibrate import Calibration, calibrate, makers
-from ccnn_torch.calibration.config import RunConfig, dump_config, load_config, method_names
+from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.learning.fitting import check_storable
 from ccnn_torch.calibration.learning.progress import HeldOut, ProgressBar
 from ccnn_torch.calibration.outputs import write_outputs
@@ -40,7 +40,7 @@ def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> Ru
     _check(config)
     config, prepared = _prepared(config)
     with RunFolder.fresh(config.out, config.name) as folder:
-        folder.write("config.yaml", dump_config(config, folder.path))
+        folder.write("config.yaml", config.to_yaml(folder.path))
         _run(config, prepared, folder, quiet, tables)
     return folder
 
@@ -57,7 +57,7 @@ def resume_run(path: Path, quiet: bool = False, tables: bool = True) -> RunFolde
         note(f"{path} is finished; nothing to do", quiet)
         return folder
     with RunFolder.existing(path) as folder:
-        config = load_config(folder.config, [])
+        config = RunConfig.from_file(folder.config, [])
         refuse_changes(folder.checkpoints, facts_of(config), folder.config)
         _check(config)
         _run(*_prepared(config), folder, quiet, tables)

@@ -10,26 +10,12 @@ from typing import Annotated
 
 import typer
 
-from ccnn_torch.cli.blind_check import blind_check
-from ccnn_torch.cli.check import check
-from ccnn_torch.cli.compare import compare
-from ccnn_torch.cli.compensate import compensate
-from ccnn_torch.cli.diagnose import diagnose
-from ccnn_torch.cli.export import export
-from ccnn_torch.cli.identify import identify
-from ccnn_torch.cli.keys import keys
-from ccnn_torch.cli.new import new
-from ccnn_torch.cli.picture import picture
-from ccnn_torch.cli.plan import plan
-from ccnn_torch.cli.run import run
-from ccnn_torch.cli.sign import sign
-from ccnn_torch.cli.simulate import simulate
-from ccnn_torch.cli.suite import suite
-from ccnn_torch.cli.sweep import sweep
-from ccnn_torch.cli.verify import verify
+from ccnn_torch.cli.from_records import check, diagnose, identify, new, run
+from ccnn_torch.cli.studies import blind_check, compare, keys, plan, simulate, suite, sweep
+from ccnn_torch.cli.with_model import compensate, export, picture, sign, verify
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError, MethodFailedError, out_of_memory
-from ccnn_torch.run_folder.interrupt import Stopped
+from ccnn_torch.run_folder.folder import Stopped
 from ccnn_torch.version import __version__
 
 # Maximum characters of a message. The longest of this package, which lists wrong keys, has some hundreds.

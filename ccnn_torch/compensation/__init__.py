@@ -1,32 +1,65 @@
 """Compensator (guard, limit, fixed point), its hook on inverse kinematics, and model files."""
 
-from ccnn_torch.compensation.compensator import Compensator as Compensator
-from ccnn_torch.compensation.compensator import Solution as Solution
-from ccnn_torch.compensation.compensator import default_limit as default_limit
-from ccnn_torch.compensation.domain import Domain as Domain
-from ccnn_torch.compensation.effects.effects import Care as Care
-from ccnn_torch.compensation.effects.effects import PhysicalEffects as PhysicalEffects
-from ccnn_torch.compensation.effects.effects import effect_deviation as effect_deviation
-from ccnn_torch.compensation.effects.effects import expand_effects as expand_effects
-from ccnn_torch.compensation.effects.effects import gains as gains
-from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
-from ccnn_torch.compensation.geometry.expanded import expand_geometry as expand_geometry
-from ccnn_torch.compensation.geometry.identified import Geometry as Geometry
-from ccnn_torch.compensation.geometry.identified import geometric_deviation as geometric_deviation
-from ccnn_torch.compensation.machine.inverse import build_machine as build_machine
-from ccnn_torch.compensation.machine.machine import Machine as Machine
-from ccnn_torch.compensation.machine.machine import Rule as Rule
-from ccnn_torch.compensation.machine.parts import machine_parts as machine_parts
-from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry as IdentifiedGeometry
-from ccnn_torch.compensation.model_files.identified import load_compensation as load_compensation
-from ccnn_torch.compensation.model_files.identified import sign_model as sign_model
-from ccnn_torch.compensation.model_files.load import LoadedModel as LoadedModel
-from ccnn_torch.compensation.model_files.load import load_model as load_model
-from ccnn_torch.compensation.model_files.save import FORMS as FORMS
-from ccnn_torch.compensation.model_files.save import card_name as card_name
-from ccnn_torch.compensation.model_files.save import save_model as save_model
-from ccnn_torch.compensation.model_files.signature import new_key_pair as new_key_pair
-from ccnn_torch.compensation.networks import UncertainNetwork as UncertainNetwork
-from ccnn_torch.compensation.networks import network_from_description as network_from_description
-from ccnn_torch.compensation.networks import register_network as register_network
-from ccnn_torch.compensation.targets.export import export_model as export_model
+from ccnn_torch.doors import door
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from ccnn_torch.compensation.compensator import (
+        Compensator as Compensator,
+        Solution as Solution,
+        default_limit as default_limit,
+    )
+    from ccnn_torch.compensation.domain import Domain as Domain
+    from ccnn_torch.compensation.effects.effects import (
+        Care as Care,
+        PhysicalEffects as PhysicalEffects,
+        effect_deviation as effect_deviation,
+        expand_effects as expand_effects,
+        gains as gains,
+    )
+    from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
+    from ccnn_torch.compensation.geometry.chebyshev import expand as expand
+    from ccnn_torch.compensation.machine.inverse import build_machine as build_machine
+    from ccnn_torch.compensation.machine.machine import Machine as Machine, Rule as Rule
+    from ccnn_torch.compensation.machine.parts import (
+        geometric_deviation as geometric_deviation,
+        machine_parts as machine_parts,
+    )
+    from ccnn_torch.compensation.model_files.identified import (
+        IdentifiedGeometry as IdentifiedGeometry,
+        load_compensation as load_compensation,
+        sign_model as sign_model,
+    )
+    from ccnn_torch.compensation.model_files.load import LoadedModel as LoadedModel, load_model as load_model
+    from ccnn_torch.compensation.model_files.save import (
+        FORMS as FORMS,
+        card_name as card_name,
+        save_model as save_model,
+    )
+    from ccnn_torch.compensation.model_files.signature import new_key_pair as new_key_pair
+    from ccnn_torch.compensation.networks import (
+        UncertainNetwork as UncertainNetwork,
+        network_from_description as network_from_description,
+        register_network as register_network,
+    )
+    from ccnn_torch.compensation.targets.export import export_model as export_model
+else:
+    __getattr__, __all__ = door(
+        __name__,
+        {
+            "compensator": "Compensator Solution default_limit",
+            "domain": "Domain",
+            "effects.effects": "Care PhysicalEffects effect_deviation expand_effects gains",
+            "fit": "fit_compensator",
+            "geometry.chebyshev": "expand",
+            "machine.inverse": "build_machine",
+            "machine.machine": "Machine Rule",
+            "machine.parts": "geometric_deviation machine_parts",
+            "model_files.identified": "IdentifiedGeometry load_compensation sign_model",
+            "model_files.load": "LoadedModel load_model",
+            "model_files.save": "FORMS card_name save_model",
+            "model_files.signature": "new_key_pair",
+            "networks": "UncertainNetwork network_from_description register_network",
+            "targets.export": "export_model",
+        },
+    )

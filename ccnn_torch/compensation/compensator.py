@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ccnn_torch.compensation.contraction import TOLERANCE
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.effects.effects import PhysicalEffects
-from ccnn_torch.compensation.geometry.identified import Geometry
+from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
 from ccnn_torch.compensation.machine.machine import ASTRAY, SETTLED, Machine
 from ccnn_torch.compensation.networks import UncertainNetwork
 from ccnn_torch.compensation.secant import Step, next_correction
@@ -110,7 +110,8 @@ class Compensator(nn.Module):
         share: of what the network learned beside its mean that is applied [1]; below 1 where all of it was too steep.
             The scaling has it already, and a model file does not store it.
         unsettled: share of regular points in and around the domain at which the machine's command does not settle.
-        geometry: commanded joints `... x n` -> γ `... x n` [SI], bounded for finite joints; None without one.
+        geometry: commanded joints `... x n` -> γ(q) = g(f(q)) - q, `... x n` [SI], f the identified forward and g the
+            nominal inverse kinematics; None without one.
         effects: commanded joints and covariates -> ε `... x n` [SI]; None without one.
         machine: the one that was identified; None without one.
     """
@@ -134,7 +135,7 @@ class Compensator(nn.Module):
         iterations: int,
         sd_scale: Tensor | None = None,
         safe_sd: Tensor | None = None,
-        geometry: Geometry | None = None,
+        geometry: ChebyshevExpansion | None = None,
         effects: PhysicalEffects | None = None,
         secant: bool = False,
         machine: Machine | None = None,
@@ -222,8 +223,7 @@ class Compensator(nn.Module):
             joints - back.correction,
             back.learned.inside,
             self._sd(there.learned, strange),
-            status_of(there, strange),
-            status_of(back, strange),
+            *(status_of(strange, way.learned.excess <= 0, way.doubt).squeeze(-1) for way in (there, back)),
         )
 
     def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -309,8 +309,7 @@ class Compensator(nn.Module):
         if self.machine is None:
             known = strange <= 0
             return _Way(torch.where(known, correction, 0.0), torch.where(known, found, 0.0), last, doubt)
-        # Written so that what is no number is not good.
-        good = (doubt <= ASTRAY) & (correction.abs() <= self.most * (1 + 1e-9)).all(-1, keepdim=True)
+        good = self.is_allowed(correction) & (doubt <= ASTRAY)
         learned = _Learned(*(torch.where(good, a, b) for a, b in zip(last, first, strict=True)))
         given = torch.where(strange <= 0, torch.where(good, correction, start), 0.0)
         return _Way(given, given, learned, doubt)
@@ -356,6 +355,10 @@ class Compensator(nn.Module):
         away = torch.relu((wanted - correction).abs() - SETTLED) @ ones
         return bounded, away + aim[..., -1:]
 
+    def is_allowed(self, correction: Tensor) -> Tensor:
+        """Whether a correction `... x n` [SI] is within the bound of the whole deviation, `... x 1`; NaN is not."""
+        return (correction.abs() <= self.most * (1 + 1e-9)).all(-1, keepdim=True)
+
     def _back(self, command: Tensor, covariates: Tensor, strange: Tensor) -> _Way:
         """From a finite command to the ideal joints."""
         if self.machine is None:
@@ -368,8 +371,7 @@ class Compensator(nn.Module):
             for _ in range(self.iterations):
                 correction = found
                 found, doubt = self.step_back(command - correction, correction, aim)
-            good = (doubt <= ASTRAY) & (correction.abs() <= self.most * (1 + 1e-9)).all(-1, keepdim=True)
-            found = torch.where(good, correction, start)
+            found = torch.where(self.is_allowed(correction) & (doubt <= ASTRAY), correction, start)
         given = torch.where(strange <= 0, found, 0.0)
         return _Way(given, -given, learned, doubt)
 
@@ -412,12 +414,19 @@ class Compensator(nn.Module):
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
 
 
-def status_of(way: _Way, strange: Tensor) -> Tensor:
-    """`...`, int64; strange: how many inputs were not finite, `... x 1`."""
-    excess, doubt, lost = (v.squeeze(-1) for v in (way.learned.excess, way.doubt, strange))
-    found = torch.where(excess > 0, OUTSIDE, EXACT)
-    # Written so that what is no number is not exact.
-    return torch.where(lost > 0, NOT_FINITE, torch.where(doubt <= 0, found, DAMPED))
+def status_of(strange: Tensor, inside: Tensor, doubt: Tensor | None = None) -> Tensor:
+    """Of a command, `... x 1`, int64.
+
+    Args:
+        strange: how many inputs were not finite, `... x 1`.
+        inside: whether it is inside the domain and is what the model promises, `... x 1`.
+        doubt: above 0 where it is not the exact one, `... x 1`.
+    """
+    found = torch.where(inside, EXACT, OUTSIDE)
+    if doubt is not None:
+        # Written so that what is no number is not exact.
+        found = torch.where(doubt <= 0, found, DAMPED)
+    return torch.where(strange > 0, NOT_FINITE, found)
 
 
 def default_limit(deviations: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from ccnn_torch.compensation.contraction import (
 )
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.effects.effects import PhysicalEffects
-from ccnn_torch.compensation.geometry.identified import Geometry
+from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
 from ccnn_torch.compensation.machine.machine import ASTRAY, FARTHEST, Machine
 from ccnn_torch.compensation.secant import Step, secant_steps
 from ccnn_torch.coordinates import Coordinate
@@ -51,7 +51,7 @@ def fit_compensator(
     margin: float = 0.1,
     transition: float = 0.5,
     sd_scale: Tensor | None = None,
-    geometry: Geometry | None = None,
+    geometry: ChebyshevExpansion | None = None,
     effects: PhysicalEffects | None = None,
     machine: Machine | None = None,
 ) -> Compensator:

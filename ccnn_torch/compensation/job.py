@@ -17,10 +17,10 @@ from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.wanted_poses import WantedPoses
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError
-from ccnn_torch.records.headers import columns_there
+from ccnn_torch.files.read import parse_json, read_text
+from ccnn_torch.records.headers import columns_there, stack_columns
 from ccnn_torch.records.joint_map import JointMap, read_joint_map
 from ccnn_torch.records.load import JOINT_LIMIT
-from ccnn_torch.records.pose_columns import stack_columns
 from ccnn_torch.records.read_table import mapped, read_parts
 from ccnn_torch.records.table import Table, writing_table
 from ccnn_torch.units import from_si
@@ -28,6 +28,7 @@ from ccnn_torch.units import from_si
 Array: TypeAlias = NDArray[Any]
 Model: TypeAlias = LoadedModel | IdentifiedGeometry
 
+_LARGEST = 500_000_000
 ROWS = 1024
 """Rows that a model takes at once: its calls count for nothing then, and it takes a hundred MB."""
 
@@ -48,6 +49,14 @@ class Compensated:
     damped: int = 0
     fallback: int = 0
     first: str = ""
+
+
+def is_of_motion(path: Path) -> bool:
+    """Whether a file is one that `ccnn diagnose --motion` writes for commands to be corrected by."""
+    if path.suffix != ".json" or not path.is_file():
+        return False
+    content = parse_json(read_text(path, _LARGEST), str(path))
+    return isinstance(content, dict) and {"axes", "mechanism", "left"} <= content.keys()
 
 
 def compensate_table(

@@ -13,12 +13,12 @@ from ccnn_torch.errors import InputError, ModelFileError
 _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "constant": "ccnn_torch.learners.constant:ConstantNetwork",
     "grnn": "ccnn_torch.learners.grnn_network:GRNNNetwork",
-    "gp": "ccnn_torch.learners.gp_posterior:GPNetwork",
+    "gp": "ccnn_torch.learners.gaussian_process:GPNetwork",
     "masked": "ccnn_torch.evolution.masked_network:MaskedNetwork",
     "forward": "ccnn_torch.compensation.machine.machine:Machine",
     "inverse": "ccnn_torch.compensation.machine.inverse:InverseMachine",
     "physical_effects": "ccnn_torch.compensation.effects.effects:PhysicalEffects",
-    "expanded_geometry": "ccnn_torch.compensation.geometry.expanded:ExpandedGeometry",
+    "expanded_geometry": "ccnn_torch.compensation.geometry.chebyshev:ChebyshevExpansion",
 }
 
 

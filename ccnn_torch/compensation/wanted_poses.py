@@ -17,9 +17,9 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_descripti
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.plugins import code_refused
+from ccnn_torch.records.headers import read_pose, stack_columns
 from ccnn_torch.records.joint_map import JointMap
 from ccnn_torch.records.load import JOINT_LIMIT
-from ccnn_torch.records.pose_columns import read_pose, stack_columns
 from ccnn_torch.records.table import Table
 from ccnn_torch.units import si_unit_of
 

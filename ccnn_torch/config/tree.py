@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
@@ -63,59 +63,53 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+
+class JobConfig(Section):
+    """The config of a command: read from a file, from keys or from the command line, and written back."""
+
     of_a_run: ClassVar[tuple[str, ...]] = ()
     """Keys that mean the same in a config for `ccnn run`, where a command takes one and leaves its other keys out."""
 
+    @classmethod
+    def from_file(cls, path: str | Path | None, overrides: Iterable[str] = (), note: Note | None = None) -> Self:
+        """Read a config file and put overrides ``key.sub=value`` over it; its name is the file's unless it has one.
 
-def config_from_file(
-    model: type[Config],
-    path: str | Path,
-    overrides: Iterable[str],
-    note: Note | None = None,
-) -> Config:
-    """Read a config file and put overrides ``key.sub=value`` over it; its name is the file's unless it has one.
+        Args:
+            path: the file, or a config for `ccnn run` as `ccnn new` writes it; None for defaults alone.
+            overrides: ``key.sub=value``.
+            note: called with a sentence that names the keys of `ccnn run` that were left out.
 
-    Args:
-        model: class of the config.
-        path: the file.
-        overrides: ``key.sub=value``.
-        note: called with a sentence that names the keys of `ccnn run` that were left out.
+        Raises:
+            InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+        """
+        tree: dict[str, Any] = {}
+        if path is not None:
+            path = Path(path)
+            tree = _used(read_yaml(path), cls, path, note)
+            if "name" in cls.model_fields:
+                tree.setdefault("name", path.stem)
+            # Links are resolved, as the system does for `..` and as `to_yaml` does.
+            resolve_paths(tree, Path(os.path.realpath(path.parent)))
+        given = apply_overrides(tree, overrides, Path.cwd())
+        filled = {key: value for key, value in tree.items() if value is not None}
+        return validated(cls, filled, str(path or "command line"), given)
 
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    path = Path(path)
-    tree = _used(read_yaml(path), model, path, note)
-    tree.setdefault("name", path.stem)
-    # Links are resolved, as the system does for `..` and as `written` does.
-    resolve_paths(tree, Path(os.path.realpath(path.parent)))
-    given = apply_overrides(tree, overrides, Path.cwd())
-    return validated(model, tree, str(path), given)
+    @classmethod
+    def from_keys(cls, **keys: Any) -> Self:
+        """A config from keys, e.g. ``RunConfig.from_keys(case="tripod", repeats=3)``; paths from the current folder.
 
+        Raises:
+            InputError: keys are wrong: one line that names them all.
+        """
+        resolve_paths(keys, Path.cwd())
+        return validated(cls, keys, "config", {})
 
-def config_from_options(
-    model: type[Config],
-    path: Path | None,
-    overrides: Iterable[str],
-    note: Note | None = None,
-) -> Config:
-    """As `config_from_file` for commands that need no file: defaults where there is none, and for empty keys.
-
-    Args:
-        model: class of the config.
-        path: the file.
-        overrides: ``key.sub=value``.
-        note: called with a sentence that names the keys of `ccnn run` that were left out.
-
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    tree = {} if path is None else _used(read_yaml(path), model, path, note)
-    if path is not None:
-        resolve_paths(tree, path.absolute().parent)
-    given = apply_overrides(tree, overrides, Path.cwd())
-    filled = {key: value for key, value in tree.items() if value is not None}
-    return validated(model, filled, str(path or "command line"), given)
+    def to_yaml(self, folder: Path | None = None) -> str:
+        """Every key as YAML for `from_file`; paths relative to `folder`, so that both can be moved, else absolute."""
+        tree = self.model_dump(mode="json")
+        if folder is not None:
+            relate_paths(tree, folder)
+        return dump_yaml(tree)
 
 
 def _used(tree: dict[str, Any], model: type[BaseModel], path: Path, note: Note | None) -> dict[str, Any]:
@@ -151,17 +145,6 @@ def _foreign(tree: Mapping[str, Any], model: type[BaseModel], run: type[BaseMode
                 yield from ((key, *below) for below in _foreign(value, ours, its))
 
 
-def config_from_keys(model: type[Config], keys: Mapping[str, Any]) -> Config:
-    """A config from keys; relative paths start from the current folder.
-
-    Raises:
-        InputError: keys are wrong: one line that names them all.
-    """
-    tree = dict(keys)
-    resolve_paths(tree, Path.cwd())
-    return validated(model, tree, "config", {})
-
-
 def validated(model: type[Config], tree: Mapping[str, Any], source: str, given: Mapping[str, str]) -> Config:
     """A config from a tree of keys whose paths are absolute.
 
@@ -178,16 +161,3 @@ def validated(model: type[Config], tree: Mapping[str, Any], source: str, given: 
         return model.model_validate(tree)
     except ValidationError as error:
         raise InputError(explain(error, model, source, given)) from None
-
-
-def written(config: BaseModel, folder: Path | None) -> str:
-    """A resolved config as YAML, every key written out.
-
-    Args:
-        config: what to write.
-        folder: of the file; paths are written relative to it, so that both can be moved. Absolute when None.
-    """
-    tree = config.model_dump(mode="json")
-    if folder is not None:
-        relate_paths(tree, folder)
-    return dump_yaml(tree)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from ccnn_torch.config.keys import list_keys
-from ccnn_torch.config.noise import Noise
-from ccnn_torch.config.sizes import size
-from ccnn_torch.config.tree import Columns, Files, JointMap, Names, Section, config_from_options
+from ccnn_torch.config.sizes import Noise, size
+from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap, Names
 from ccnn_torch.errors import InputError
 from ccnn_torch.run_folder.folder import refuse_foreign
 
@@ -34,7 +31,7 @@ def _deviation(value: Any) -> Any:
     return value
 
 
-class DiagnoseConfig(Section):
+class DiagnoseConfig(JobConfig):
     """Options of `ccnn diagnose` and `ccnn check`."""
 
     of_a_run = ("records", "columns", "joint_map", "mechanism", "mechanism_keys", "covariates", "seed")
@@ -79,20 +76,6 @@ class DiagnoseConfig(Section):
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of folds and resampling")
 
 
-def load_diagnose_config(
-    path: Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
-) -> DiagnoseConfig:
-    """Read a config file (defaults where there is none) and put overrides ``key.sub=value`` over it.
-
-    A config for `ccnn run`, as `ccnn new` writes it, gives its records, mechanism, columns and seed; `note` is called
-    with a sentence on the others.
-
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    return config_from_options(DiagnoseConfig, path, overrides, note)
-
-
 def folder_of(config: DiagnoseConfig) -> Path:
     """The folder that a diagnosis writes; of an earlier diagnosis or check it is written over.
 
@@ -104,8 +87,3 @@ def folder_of(config: DiagnoseConfig) -> Path:
     folder = Path(config.out)
     refuse_foreign(folder, ("diagnosis.json", "check.json"))
     return folder
-
-
-def describe_diagnose_keys() -> list[tuple[str, str, str]]:
-    """Every key with its default and what it means."""
-    return list(list_keys(DiagnoseConfig))

@@ -204,7 +204,7 @@ def _notes(
     notes = [unseen_text(name, reason) for name, reason in lacking.items()]
     notes += [lacking_text(mechanism.name, condition) for condition in mechanism.lacking(covariates)]
     notes += not_held_notes(judgement.names)
-    for atom in (analysis.dictionary.atoms[i] for i in judgement.found.members):
+    for atom in (analysis.atoms[i] for i in judgement.found.members):
         if atom.note and atom.is_discrepancy:
             row = "" if atom.begins is None else f" from row {int(chosen[atom.begins]) + 1} on (counted from 1)"
             notes.append(atom.note + row)
@@ -213,7 +213,7 @@ def _notes(
     notes += [shared_text(analysis.correlation)] if analysis.correlation.value else []
     if len(analysis.measured) < int(rows.fine.sum()) - copies:
         notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were evaluated")
-    atoms = analysis.dictionary.atoms
+    atoms = analysis.atoms
     beside = [atoms[i] for i in judgement.fullest.members if i not in judgement.found.members]
     corrections = [a.name for a in beside if not a.is_discrepancy]
     if judgement.names and corrections:

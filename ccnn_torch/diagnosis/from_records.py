@@ -25,8 +25,8 @@ from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, fit_frames, judg
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES
+from ccnn_torch.records.load import FILE, is_frame
 from ccnn_torch.records.read_table import Frame
-from ccnn_torch.records.sources import FILE, is_frame
 
 _POSITION = {"x": 0, "y": 1, "z": 2}
 # Names that a note lists.

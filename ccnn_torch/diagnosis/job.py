@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.config.noise import noise_of_pose
+from ccnn_torch.config.sizes import noise_of_pose
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of, with_network
 from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
 from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
@@ -24,8 +24,7 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism, simulated_rows
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.screen import say_place, stdout, step_bar
 from ccnn_torch.report.table import print_text
-from ccnn_torch.run_folder.interrupt import if_stopped
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import if_stopped, locked
 
 
 def run_diagnosis(config: DiagnoseConfig, quiet: bool = False, details: bool = False) -> Path:
@@ -93,7 +92,7 @@ def _complete(config: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: boo
         path = write_diagnosis(folder, found, about, config.seed)
     if not quiet:
         print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False, details=details)
-        say_place(f"Written: {path} and report.html beside it")
+        say_place(f"Written: {typed_path(str(path))} and report.html beside it")
 
 
 def _noise(config: DiagnoseConfig, records: Records) -> dict[str, float] | None:

@@ -18,12 +18,12 @@ from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.diagnosis.candidates.atom import scales
 from ccnn_torch.diagnosis.candidates.library import LOG_PRIOR
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
 from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, Whitening, moving_channels, renewed
 from ccnn_torch.effects import Acting, Effect, Situation
+from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.outliers import inlying
 

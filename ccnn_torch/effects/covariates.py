@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.thermal import REFERENCE
+from ccnn_torch.effects.time import REFERENCE
 from ccnn_torch.mechanisms import Mechanism
 
 SHIFT = 8 * 3600.0

@@ -38,23 +38,17 @@ def open_engine(engine: str) -> Iterator[Executor]:
     """An executor of an engine other than `local`; it is closed at the end, and what runs there is stopped.
 
     Raises:
-        InputError: Dask is not installed, or its scheduler does not answer.
+        InputError: joblib or Dask is not installed, or its scheduler does not answer.
     """
     if engine == "processes":
-        from joblib import cpu_count
-        from joblib.externals.loky import ProcessPoolExecutor
-
         # Fresh processes, which inherit no threads; as many as this process may use processors.
-        pool = ProcessPoolExecutor(cpu_count())
+        pool = _needed("joblib.externals.loky", engine).ProcessPoolExecutor(_needed("joblib", engine).cpu_count())
         try:
             yield pool
         finally:
             pool.shutdown(kill_workers=True)
         return
-    try:
-        distributed: Any = importlib.import_module("distributed")
-    except ImportError:
-        raise InputError(f"engine={engine} needs Dask: pip install 'ccnn-torch[cluster]'") from None
+    distributed = _needed("distributed", engine)
     if engine == "dask":
         cluster = distributed.LocalCluster(threads_per_worker=1, dashboard_address=None)
         with cluster, distributed.Client(cluster, set_as_default=False) as client:
@@ -66,3 +60,11 @@ def open_engine(engine: str) -> Iterator[Executor]:
         raise InputError(f"engine={engine}: no scheduler answers there ({problem})") from None
     with client:
         yield client.get_executor(pure=False)
+
+
+def _needed(module: str, engine: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        raise InputError(f"engine={engine} needs {package}: pip install 'ccnn-torch[cluster]'") from None

@@ -1,12 +1,9 @@
 """Evolution of networks: genomes, encoding, operators, joined evaluation, coevolution, refinement, masked networks."""
 
 from ccnn_torch.evolution.coevolution import Coevolution as Coevolution
-from ccnn_torch.evolution.encoding import decode as decode
-from ccnn_torch.evolution.encoding import encode as encode
+from ccnn_torch.evolution.encoding import decode as decode, encode as encode
 from ccnn_torch.evolution.genome import Genome as Genome
 from ccnn_torch.evolution.masked_network import MaskedNetwork as MaskedNetwork
-from ccnn_torch.evolution.network import alive_nodes as alive_nodes
-from ccnn_torch.evolution.network import forward as forward
-from ccnn_torch.evolution.network import prune as prune
+from ccnn_torch.evolution.network import alive_nodes as alive_nodes, forward as forward, prune as prune
 from ccnn_torch.evolution.refinement import refine as refine
 from ccnn_torch.evolution.settings import CCNNSettings as CCNNSettings

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.genome import Genome, active, select
+from ccnn_torch.evolution.genome import Genome, kept, select
 from ccnn_torch.evolution.operators import (
     crossover,
     flip_connections,
@@ -23,35 +23,11 @@ from ccnn_torch.evolution.operators import (
     weakest_draw,
 )
 from ccnn_torch.evolution.random import uniform
+from ccnn_torch.evolution.settings import EvolutionSettings
 
-
-class BreedingSettings(Protocol):
-    """What breeding reads of a learner's settings; the names of `CCNNSettings`."""
-
-    @property
-    def population(self) -> int: ...
-    @property
-    def elites(self) -> int: ...
-    @property
-    def tournament(self) -> int: ...
-    @property
-    def crossover(self) -> float: ...
-    @property
-    def crossover_kind(self) -> Literal["point", "uniform"]: ...
-    @property
-    def cuts(self) -> int: ...
-    @property
-    def structural_mutation(self) -> float: ...
-    @property
-    def weight_mutation(self) -> float: ...
-    @property
-    def nonuniform_exponent(self) -> float: ...
-    @property
-    def weight_range(self) -> float: ...
-    @property
-    def density(self) -> float: ...
-    @property
-    def bias(self) -> bool: ...
+# What paper 000 leaves open and what made no difference on its cases: contestants of one tournament, cut points of a
+# crossover. b of eq. 13 is the paper's.
+CONTESTANTS, CUTS, EXPONENT = 3, 2, 2.0
 
 
 class BreedingDraws(NamedTuple):
@@ -60,7 +36,7 @@ class BreedingDraws(NamedTuple):
     Attributes:
         contestants: `r x 2h x t`.
         pairs: whether a pair is crossed, `r x h`.
-        places: cut places `r x h x cuts`, or one number a gene `r x h x genes`.
+        places: cut places, `r x h x cuts`.
         flips, fresh: bits that flip, and the weights of those that appear, `r x h x out x in`.
         genes, steps: which weights mutate, and how far, `r x h x out x (in or in + 1)`.
     """
@@ -74,15 +50,14 @@ class BreedingDraws(NamedTuple):
     steps: Tensor
 
 
-def breeding_shapes(population: Genome, settings: BreedingSettings) -> list[tuple[int, ...]]:
+def breeding_shapes(population: Genome, settings: EvolutionSettings) -> list[tuple[int, ...]]:
     """Shapes of `BreedingDraws` for one repeat."""
     half = (settings.population - settings.elites + 1) // 2
     bits, reals = tuple(population.mask.shape[2:]), tuple(population.weight.shape[2:])
-    places = math.prod(reals) if settings.crossover_kind == "uniform" else settings.cuts
     return [
-        (2 * half, settings.tournament),
+        (2 * half, CONTESTANTS),
         (half,),
-        (half, places),
+        (half, CUTS),
         (half, *bits),
         (half, *bits),
         (half, *reals),
@@ -90,17 +65,17 @@ def breeding_shapes(population: Genome, settings: BreedingSettings) -> list[tupl
     ]
 
 
-def initial_population(outputs: int, inputs: int, settings: BreedingSettings, seeds: Tensor, stream: int) -> Genome:
+def initial_population(outputs: int, inputs: int, settings: EvolutionSettings, seeds: Tensor, stream: int) -> Genome:
     """Random structures of the stated density, weights uniform in the range; `r x population x out x in (+ 1)`."""
     size = settings.population
     draws = uniform(seeds, stream, 0, (size, outputs, 2 * inputs + settings.bias))
     mask = draws[..., :inputs] < settings.density
     weight = (draws[..., inputs:] * 2 - 1) * settings.weight_range
-    return Genome(mask, torch.where(active(Genome(mask, weight)), weight, torch.zeros_like(weight)))
+    return Genome(mask, kept(mask, weight))
 
 
 def breed(
-    population: Genome, fitness: Tensor, settings: BreedingSettings, progress: float, draws: BreedingDraws
+    population: Genome, fitness: Tensor, settings: EvolutionSettings, progress: float, draws: BreedingDraws
 ) -> Genome:
     """Children of one subpopulation, `r x (population - elites) x ...`.
 
@@ -115,7 +90,7 @@ def breed(
 def breed_networks(
     layers: Sequence[Genome],
     fitness: Tensor,
-    settings: BreedingSettings,
+    settings: EvolutionSettings,
     progress: float,
     draws: Sequence[BreedingDraws],
 ) -> list[Genome]:
@@ -135,7 +110,7 @@ def breed_networks(
 
 
 def _children(
-    parents: Genome, crossed: Tensor, settings: BreedingSettings, progress: float, draws: BreedingDraws
+    parents: Genome, crossed: Tensor, settings: EvolutionSettings, progress: float, draws: BreedingDraws
 ) -> Genome:
     """Two parents give two children. The first of each pair goes to structural mutation, the second to non-uniform
     mutation of its weights: the paper's hybrid search, half and half.
@@ -149,18 +124,18 @@ def _children(
         Genome(parents.mask[:, part], parents.weight[:, part]) for part in (slice(0, half), slice(half, None))
     )
     shape = parents.weight.shape[2:]
-    swap = swap_genes(settings.crossover_kind, draws.places, math.prod(shape)).reshape(-1, half, *shape)
+    swap = swap_genes(draws.places, math.prod(shape)).reshape(-1, half, *shape)
     first, second = crossover(mothers, fathers, swap & crossed[..., None, None])
     limit = settings.weight_range
     first = flip_connections(first, draws.flips < settings.structural_mutation, (draws.fresh * 2 - 1) * limit)
     chosen = (draws.genes < settings.weight_mutation) | weakest_draw(second, draws.genes)
-    second = nonuniform_mutation(second, chosen, draws.steps, progress, -limit, limit, settings.nonuniform_exponent)
+    second = nonuniform_mutation(second, chosen, draws.steps, progress, -limit, limit, EXPONENT)
     count = settings.population - settings.elites
     return Genome(*(torch.cat(pair, dim=1)[:, :count] for pair in zip(first, second, strict=True)))
 
 
 def with_elites(
-    children: Genome, population: Genome, fitness: Tensor, best: Genome, settings: BreedingSettings
+    children: Genome, population: Genome, fitness: Tensor, best: Genome, settings: EvolutionSettings
 ) -> Genome:
     """Elites before the children: the part of the best joined network, then the best of the population.
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ccnn_torch.evolution.breeding import BreedingDraws, breed, breeding_shapes, initial_population, with_elites
 from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
-from ccnn_torch.evolution.genome import Genome, active, select
+from ccnn_torch.evolution.genome import Genome, kept, select
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import CCNNSettings
 
@@ -24,6 +24,9 @@ _T = TypeVar("_T")
 
 # Streams of random numbers: one for the generations, one for each layer's first individuals.
 _GENERATIONS, _FIRST = 0, 1
+
+REPRESENTATIVES = 3
+"""Random representatives of every other subpopulation beside its best."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +66,9 @@ def start(sizes: Sequence[int], task: Task, settings: CCNNSettings, seeds: Tenso
         best_fitness=task.inputs.new_zeros(len(seeds)),
         generation=0,
     )
-    company = uniform_parts(seeds, _GENERATIONS, 0, [_company_shape(state, settings)])[0]
+    company = uniform_parts(seeds, _GENERATIONS, 0, [_company_shape(state)])[0]
     for layer, population in enumerate(populations):
-        state = _judge(state, layer, population, company[:, layer], task, settings)
+        state = _judge(state, layer, population, company[:, layer], task)
     return state
 
 
@@ -74,32 +77,30 @@ def advance(state: Coevolution, task: Task, settings: CCNNSettings, seeds: Tenso
     state = replace(state, generation=state.generation + 1)
     progress = state.generation / settings.generations
     shapes = [breeding_shapes(population, settings) for population in state.populations]
-    all_shapes = [_company_shape(state, settings), *itertools.chain(*shapes)]
+    all_shapes = [_company_shape(state), *itertools.chain(*shapes)]
     company, *numbers = uniform_parts(seeds, _GENERATIONS, state.generation, all_shapes)
     for layer, (population, scores) in enumerate(zip(state.populations, state.fitness, strict=True)):
         taken = sum(len(before) for before in shapes[:layer])
         draws = BreedingDraws(*numbers[taken : taken + len(shapes[layer])])
         children = breed(population, scores, settings, progress, draws)
         renewed = with_elites(children, population, scores, state.best[layer], settings)
-        state = _judge(state, layer, renewed, company[:, layer], task, settings)
+        state = _judge(state, layer, renewed, company[:, layer], task)
     return state
 
 
-def _company_shape(state: Coevolution, settings: CCNNSettings) -> tuple[int, ...]:
+def _company_shape(state: Coevolution) -> tuple[int, ...]:
     layers = len(state.populations)
-    return layers, layers, settings.representatives
+    return layers, layers, REPRESENTATIVES
 
 
-def _judge(
-    state: Coevolution, layer: int, population: Genome, company: Tensor, task: Task, settings: CCNNSettings
-) -> Coevolution:
+def _judge(state: Coevolution, layer: int, population: Genome, company: Tensor, task: Task) -> Coevolution:
     """Fitness of a renewed subpopulation, and the best joined network if one of its networks beats it.
 
     Args:
         company: numbers that choose the random representatives, `r x layers x representatives`.
     """
     companions = _companions(state, company)
-    scores = fitness(joined_errors(layer, population, companions, task), settings.epsilon)
+    scores = fitness(joined_errors(layer, population, companions, task))
     best_company, which = scores.max(-1)
     winner_fitness, winner = best_company.max(-1, keepdim=True)
     beside = which.gather(-1, winner)
@@ -136,7 +137,7 @@ def keep_refined(state: Coevolution, refined: Sequence[Genome], scores: Tensor) 
         refined: parts of complete networks, `r x 1 x ...`; weights without a connection are dropped.
         scores: their fitness, `r`.
     """
-    return _keep_best(state, [Genome(g.mask, torch.where(active(g), g.weight, 0.0)) for g in refined], scores)
+    return _keep_best(state, [Genome(g.mask, kept(*g)) for g in refined], scores)
 
 
 def _keep_best(state: Coevolution, joined: Sequence[Genome], scores: Tensor) -> Coevolution:

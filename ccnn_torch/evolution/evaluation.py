@@ -53,9 +53,13 @@ def make_task(inputs: Tensor, targets: Tensor, weights: Tensor) -> Task:
     )
 
 
-def fitness(errors: Tensor, epsilon: float) -> Tensor:
+EPSILON = 1e-6
+"""Added to the error in eq. 11, on standardised outputs."""
+
+
+def fitness(errors: Tensor) -> Tensor:
     """Eq. 11: 1 / (mean Euclidean output error + epsilon)."""
-    return 1 / (errors + epsilon)
+    return 1 / (errors + EPSILON)
 
 
 class _Signal(NamedTuple):

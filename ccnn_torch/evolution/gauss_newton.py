@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.evolution.network import alive_nodes
 from ccnn_torch.evolution.waves import Waves, wave_inputs
 from ccnn_torch.numerics.blocks import blocks
 
@@ -85,14 +86,8 @@ def network_of(masks: list[Tensor], bias: bool, waves: Waves | None = None) -> N
     hidden = masks[-1].shape[-1] - 2 * slots
     periodic = masks[-1][..., hidden:].to(torch.float64)
     counts = [m.to(torch.float64) for m in (*masks[:-1], masks[-1][..., :hidden])]
-    fed = [torch.ones_like(counts[0][:, 0, :])]
-    for mask in counts:
-        fed.append(((mask @ fed[-1].unsqueeze(-1)).squeeze(-1) > 0).to(torch.float64))
-    used = [torch.ones_like(counts[-1][:, :, 0])]
-    for mask in reversed(counts):
-        used.insert(0, ((used[0].unsqueeze(-2) @ mask).squeeze(-2) > 0).to(torch.float64))
-    alive = [f * u for f, u in zip(fed, used, strict=True)]
-    alive[-1] = used[-1]  # an output without inputs keeps its bias: it is then a constant
+    ends = counts[0].new_ones(len(source), masks[0].shape[-1]), counts[0].new_ones(len(source), masks[-1].shape[-2])
+    alive = [ends[0], *(nodes.to(torch.float64) for nodes in alive_nodes(masks)), ends[1]]
     effective = [
         mask * alive[index + 1].unsqueeze(-1) * alive[index].unsqueeze(-2) for index, mask in enumerate(counts)
     ]

@@ -31,6 +31,11 @@ def active(genome: Genome) -> Tensor:
     return torch.cat([mask, mask.new_ones((*mask.shape[:-1], 1))], dim=-1)
 
 
+def kept(mask: Tensor, weight: Tensor) -> Tensor:
+    """Weights, 0 where there is no connection; arguments and result as those of a `Genome`."""
+    return torch.where(active(Genome(mask, weight)), weight, 0.0)
+
+
 def select(genome: Genome, index: Tensor) -> Genome:
     """Individuals by number. genome: `r x p x ...`; index: `r x c`, int64; returns `r x c x ...`."""
     repeats, individuals = genome.mask.shape[:2]

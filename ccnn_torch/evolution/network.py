@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.genome import Genome, active
+from ccnn_torch.evolution.genome import kept
 from ccnn_torch.evolution.waves import Waves, wave_signal
 
 
@@ -61,7 +61,7 @@ def forward(masks: Sequence[Tensor], weights: Sequence[Tensor], inputs: Tensor, 
         `... x s x o`.
     """
     signal = hidden_signal(masks, weights, inputs, waves)
-    return _affine(signal, _kept(masks[-1], weights[-1]))
+    return _affine(signal, kept(masks[-1], weights[-1]))
 
 
 def hidden_signal(
@@ -71,7 +71,7 @@ def hidden_signal(
     fed = fed_nodes(masks)
     signal = inputs[..., : masks[0].shape[-1]] if len(masks) > 1 else inputs[..., : _width(masks, waves)]
     for mask, weight, reached in zip(masks[:-1], weights[:-1], fed, strict=True):
-        signal = torch.sigmoid(_affine(signal, _kept(mask, weight))) * reached.unsqueeze(-2)
+        signal = torch.sigmoid(_affine(signal, kept(mask, weight))) * reached.unsqueeze(-2)
     if waves is None:
         return signal
     periodic = wave_signal(waves, inputs)
@@ -82,10 +82,6 @@ def hidden_signal(
 def _width(masks: Sequence[Tensor], waves: Waves | None) -> int:
     """Columns of the output's mask that are not of waves."""
     return masks[-1].shape[-1] - (0 if waves is None else 2 * waves.frequency.shape[-1])
-
-
-def _kept(mask: Tensor, weight: Tensor) -> Tensor:
-    return torch.where(active(Genome(mask, weight)), weight, torch.zeros_like(weight))
 
 
 def _affine(signal: Tensor, weight: Tensor) -> Tensor:
@@ -108,11 +104,11 @@ def average(masks: Sequence[Tensor], weights: Sequence[Tensor], slots: int = 0) 
     wide_masks, wide_weights = [], []
     for layer, (mask, weight) in enumerate(zip(masks, weights, strict=True)):
         width = mask.shape[-1]
-        kept = torch.where(active(Genome(mask, weight)), weight, 0.0)
-        parts = [mask, kept[..., :width], kept[..., width:]]
+        connected = kept(mask, weight)
+        parts = [mask, connected[..., :width], connected[..., width:]]
         if layer == last:
             # Outputs are summed, so every share is divided.
-            parts = [mask, kept[..., :width] / members, kept[..., width:].mean(-3)]
+            parts = [mask, connected[..., :width] / members, connected[..., width:].mean(-3)]
         if layer == last and slots:
             hidden = width - 2 * slots
             connections = [
@@ -156,7 +152,7 @@ def prune(masks: Sequence[Tensor], weights: Sequence[Tensor]) -> tuple[list[Tens
     Args:
         masks, weights: one a layer, `out x in` and `out x (in or in + 1)`.
     """
-    weights = [torch.where(active(Genome(m, w)), w, torch.zeros_like(w)) for m, w in zip(masks, weights, strict=True)]
+    weights = [kept(m, w) for m, w in zip(masks, weights, strict=True)]
     alive = alive_nodes(masks)
     if alive and not bool(alive[0].any()):
         outputs, inputs = len(masks[-1]), masks[0].shape[-1]

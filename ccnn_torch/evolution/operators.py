@@ -28,21 +28,17 @@ def tournament(fitness: Tensor, draws: Tensor) -> Tensor:
     return contestants.gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
 
 
-def swap_genes(kind: str, draws: Tensor, genes: int) -> Tensor:
-    """Which genes two parents exchange.
+def swap_genes(draws: Tensor, genes: int) -> Tensor:
+    """Which genes two parents exchange: the row-order string is cut, and its segments are exchanged alternately.
 
     Args:
-        kind: ``"point"``: cut the row-order string at as many points as there are draws (one draw: single-point), at
-            places 1 .. genes - 1; segments are exchanged alternately, and two cuts at one place cancel.
-            ``"uniform"``: each gene independently with probability 1/2.
-        draws: uniform numbers, `... x cuts` or `... x genes`.
+        draws: uniform numbers, `... x cuts` (one: single-point), each a cut at one of the places 1 .. genes - 1; two at
+            one place cancel.
         genes: length of the string.
 
     Returns:
         `... x genes`, bool.
     """
-    if kind == "uniform":
-        return draws < 0.5
     cuts = 1 + (draws * (genes - 1)).long()
     places = torch.arange(genes, device=draws.device)
     return (places >= cuts.unsqueeze(-1)).sum(-2) % 2 == 1
@@ -92,7 +88,7 @@ def weakest_draw(genome: Genome, draws: Tensor) -> Tensor:
 
 
 def nonuniform_mutation(
-    genome: Genome, chosen: Tensor, draws: Tensor, progress: float, low: float, high: float, exponent: float = 2.0
+    genome: Genome, chosen: Tensor, draws: Tensor, progress: float, low: float, high: float, exponent: float
 ) -> Genome:
     """Non-uniform mutation, eqs. 12-13: steps that shrink with the generations.
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.genome import Genome, active
+from ccnn_torch.evolution.genome import kept
 from ccnn_torch.evolution.network import forward, hidden_signal
 from ccnn_torch.evolution.waves import Waves
 
@@ -101,9 +101,9 @@ def spread_variance(
 def _readout(mask: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Output weights with the bias last, and which of them are there: `... x m x o x (h + 1)` each."""
     width = mask.shape[-1]
-    kept = torch.where(active(Genome(mask, weight)), weight, 0.0)
-    bias = kept[..., width:] if weight.shape[-1] > width else torch.zeros_like(kept[..., :1])
-    readout = torch.cat([kept[..., :width], bias], -1)
+    connected = kept(mask, weight)
+    bias = connected[..., width:] if weight.shape[-1] > width else torch.zeros_like(connected[..., :1])
+    readout = torch.cat([connected[..., :width], bias], -1)
     return readout, torch.cat([mask, torch.ones_like(mask[..., :1])], -1).to(weight.dtype)
 
 

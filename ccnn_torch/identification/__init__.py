@@ -1,32 +1,38 @@
 """Geometric parameters of a machine from measured records."""
 
-from ccnn_torch.identification.identifiability.bootstrap import Bootstrap as Bootstrap
-from ccnn_torch.identification.identifiability.bootstrap import bootstrap as bootstrap
-from ccnn_torch.identification.identifiability.knowledge import Knowledge as Knowledge
-from ccnn_torch.identification.identifiability.knowledge import require_identifiable as require_identifiable
-from ccnn_torch.identification.identifiability.knowledge import what_is_known as what_is_known
-from ccnn_torch.identification.problems.constraints import distance_problem as distance_problem
-from ccnn_torch.identification.problems.constraints import plane_problem as plane_problem
-from ccnn_torch.identification.problems.constraints import scatter as scatter
-from ccnn_torch.identification.problems.constraints import socket_problem as socket_problem
-from ccnn_torch.identification.problems.constraints import tool_points as tool_points
+from ccnn_torch.identification.identifiability.bootstrap import Bootstrap as Bootstrap, bootstrap as bootstrap
+from ccnn_torch.identification.identifiability.knowledge import (
+    Knowledge as Knowledge,
+    require_identifiable as require_identifiable,
+    what_is_known as what_is_known,
+)
+from ccnn_torch.identification.problems.constraints import (
+    distance_problem as distance_problem,
+    plane_problem as plane_problem,
+    scatter as scatter,
+    socket_problem as socket_problem,
+    tool_points as tool_points,
+)
 from ccnn_torch.identification.problems.forward import forward_problem as forward_problem
 from ccnn_torch.identification.problems.inverse import inverse_problem as inverse_problem
-from ccnn_torch.identification.problems.parameters import ParameterChoice as ParameterChoice
-from ccnn_torch.identification.problems.parameters import Selection as Selection
-from ccnn_torch.identification.problems.parameters import select_parameters as select_parameters
-from ccnn_torch.identification.problems.problem import Channel as Channel
-from ccnn_torch.identification.problems.problem import Fit as Fit
-from ccnn_torch.identification.problems.problem import Problem as Problem
-from ccnn_torch.identification.problems.problem import Progress as Progress
-from ccnn_torch.identification.problems.problem import Solver as Solver
-from ccnn_torch.identification.solvers.legs import solve_per_leg as solve_per_leg
+from ccnn_torch.identification.problems.parameters import (
+    ParameterChoice as ParameterChoice,
+    Selection as Selection,
+    select_parameters as select_parameters,
+)
+from ccnn_torch.identification.problems.problem import (
+    Channel as Channel,
+    Fit as Fit,
+    Problem as Problem,
+    Progress as Progress,
+    Solver as Solver,
+)
 from ccnn_torch.identification.solvers.legs import split_by_leg as split_by_leg
 from ccnn_torch.identification.solvers.lm import solve_lm as solve_lm
-from ccnn_torch.identification.solvers.registry import SOLVERS as SOLVERS
-from ccnn_torch.identification.solvers.registry import get_solver as get_solver
-from ccnn_torch.identification.solvers.robust import LOSSES as LOSSES
-from ccnn_torch.identification.solvers.robust import reweighted as reweighted
-from ccnn_torch.identification.solvers.tikhonov import LCurve as LCurve
-from ccnn_torch.identification.solvers.tikhonov import l_curve as l_curve
-from ccnn_torch.identification.solvers.tikhonov import solve_tikhonov as solve_tikhonov
+from ccnn_torch.identification.solvers.registry import SOLVERS as SOLVERS, get_solver as get_solver
+from ccnn_torch.identification.solvers.robust import LOSSES as LOSSES, reweighted as reweighted
+from ccnn_torch.identification.solvers.tikhonov import (
+    LCurve as LCurve,
+    l_curve as l_curve,
+    solve_tikhonov as solve_tikhonov,
+)

@@ -5,49 +5,28 @@ Relative paths in a config file start from the file's folder, those on the comma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.split import HeldOutConfig
 from ccnn_torch.config.tree import (
     Columns,
     Files,
+    JobConfig,
     JointMap,
     Names,
     Section,
-    config_from_file,
-    config_from_keys,
-    config_from_options,
-    written,
 )
-from ccnn_torch.spelling import nearest
-
-IDENTIFY_METHODS = ("lm", "hga", "tikhonov", "ga", "sa", "pso")
-"""Solvers by name; `NAME_per_leg` identifies each leg from its own equations alone."""
+from ccnn_torch.identification.solvers.registry import SOLVERS, unknown_solver
+from ccnn_torch.planning.config import ParameterConfig
 
 PER_LEG = "_per_leg"
-
+"""A method with this ending identifies each leg from its own equations alone."""
 
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
 _LINK_TOLERANCE: dict[str, Size] = {"m": 1e-3, "rad": 1e-2}
-
-
-class ParameterConfig(Section):
-    """Which parameters are identified, by name or pattern (`A*`, `leg1.*`)."""
-
-    free: Names | None = Field(default=None, description="parameters to identify, names or patterns; null = all")
-    fixed: Names = Field(default=[], description="parameters that keep their nominal value, names or patterns")
-    tied: list[list[str]] = Field(default=[], description="groups of parameters with one common value")
-    prior: dict[str, Size] = Field(
-        default={},
-        description="standard deviation of a Gaussian prior around the nominal value, by name or pattern, in SI or "
-        "as '0.5 mm'",
-    )
 
 
 class FrameConfig(Section):
@@ -136,7 +115,7 @@ class SimulateConfig(Section):
     map: int = Field(default=0, ge=0, description="points across a map of the pose error over the workspace; 0 = none")
 
 
-class IdentifyConfig(Section):
+class IdentifyConfig(JobConfig):
     """An identification: mechanism, data, parameters, methods."""
 
     of_a_run = ("name", "seed", "records", "columns", "joint_map", "mechanism", "mechanism_keys", "split")
@@ -191,7 +170,7 @@ class IdentifyConfig(Section):
     methods: Names = Field(
         default=["lm"],
         min_length=1,
-        description=f"solvers: a list of {', '.join(IDENTIFY_METHODS)}, each also as NAME_per_leg; all = the six",
+        description="solvers: a list of lm, hga and tikhonov, each also as NAME_per_leg; all = the three",
     )
     per_leg: bool = Field(
         default=False, description="identify each leg from its own equations in every method, not only NAME_per_leg"
@@ -200,7 +179,7 @@ class IdentifyConfig(Section):
         default=None, description="loss of lm that outliers cannot pull at: huber or cauchy; null = least squares"
     )
     starts: int = Field(default=1, ge=1, description="starts of lm, the first at the nominal values")
-    hga_machines: int = Field(default=5, ge=1, description="machines that hga, ga, sa and pso are run on, at most")
+    hga_machines: int = Field(default=5, ge=1, description="machines that hga is run on, at most")
     settings: dict[str, dict[str, Any]] = Field(
         default={}, description="settings of a method, e.g. {hga: {generations: 500}}"
     )
@@ -223,13 +202,10 @@ class IdentifyConfig(Section):
     @classmethod
     def _known(cls, methods: list[str]) -> list[str]:
         if methods == ["all"]:
-            return list(IDENTIFY_METHODS)
+            return list(SOLVERS)
         for method in methods:
-            if base_method(method) not in IDENTIFY_METHODS:
-                near = nearest(method, [*IDENTIFY_METHODS, *(m + PER_LEG for m in IDENTIFY_METHODS)])
-                known = ", ".join(IDENTIFY_METHODS)
-                hint = f"did you mean '{near}'?" if near else f"known are {known}, each also as NAME_per_leg, and all"
-                raise ValueError(f"there is no method '{method}'; {hint}")
+            if base_method(method) not in SOLVERS:
+                raise ValueError(unknown_solver(method, PER_LEG))
             if methods.count(method) > 1:
                 raise ValueError(f"'{method}' is given twice")
         return methods
@@ -259,9 +235,9 @@ class IdentifyConfig(Section):
             raise ValueError("residual: measured points are compared by joints; write residual=inverse or auto")
         if self.simulate is not None and self.simulate.as_built and not self.simulate.points:
             raise ValueError("simulate.as_built: such a machine is measured by points; give simulate.points")
-        wrong = [name for name in self.settings if name not in IDENTIFY_METHODS]
+        wrong = [name for name in self.settings if name not in SOLVERS]
         if wrong:
-            raise ValueError(f"settings: '{wrong[0]}' is no method; known are {', '.join(IDENTIFY_METHODS)}")
+            raise ValueError(f"settings: {unknown_solver(wrong[0])}")
         return self
 
     def _constrained(self, constraint: ConstraintConfig) -> None:
@@ -291,38 +267,3 @@ class IdentifyConfig(Section):
 def base_method(method: str) -> str:
     """`lm` of `lm` and of `lm_per_leg`."""
     return method.removesuffix(PER_LEG)
-
-
-def load_identify_config(
-    path: str | Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
-) -> IdentifyConfig:
-    """Read a config file and put overrides ``key.sub=value`` over it; without a file these are all.
-
-    A config for `ccnn run`, as `ccnn new` writes it, gives its records, machine and split; `note` is called with a
-    sentence on the others.
-
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    if path is None:
-        return config_from_options(IdentifyConfig, None, overrides)
-    return config_from_file(IdentifyConfig, path, overrides, note)
-
-
-def make_identify_config(**keys: Any) -> IdentifyConfig:
-    """A config from keys; relative paths start from the current folder.
-
-    Raises:
-        InputError: keys are wrong: one line that names them all.
-    """
-    return config_from_keys(IdentifyConfig, keys)
-
-
-def dump_identify_config(config: IdentifyConfig, folder: Path | None = None) -> str:
-    """The resolved config as YAML, paths relative to `folder` if given; `load_identify_config` gives an equal one."""
-    return written(config, folder)
-
-
-def describe_identify_keys() -> list[tuple[str, str, str]]:
-    """Every key, dotted, with its default and what it means."""
-    return list(list_keys(IdentifyConfig))

@@ -11,17 +11,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.held_out import Given
+from ccnn_torch.config.split import Given
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Fit, Progress
-from ccnn_torch.identification.config import IdentifyConfig, base_method, dump_identify_config
+from ccnn_torch.identification.config import IdentifyConfig, base_method
 from ccnn_torch.identification.constrained.identify import identify_by_constraint
 from ccnn_torch.identification.identifiability.bootstrap import bootstrap
+from ccnn_torch.identification.judge import map_error
 from ccnn_torch.identification.measured.measured import Measured
 from ccnn_torch.identification.measured.nominal import nominal_machine
 from ccnn_torch.identification.measured.records import from_records
-from ccnn_torch.identification.result import assemble
+from ccnn_torch.identification.result import assemble, beside_truth, judged, promised, residuals_of
 from ccnn_torch.identification.simulated.counts import count_study
 from ccnn_torch.identification.simulated.machines import simulate
 from ccnn_torch.identification.solve import (
@@ -39,7 +40,7 @@ from ccnn_torch.identification.store import load_outcome, save_outcome
 from ccnn_torch.identification.transfer import read_elsewhere, transferred
 from ccnn_torch.mechanisms import Framed, Mechanism
 from ccnn_torch.records import Records, write_table
-from ccnn_torch.records.sources import read_source
+from ccnn_torch.records.load import read_source
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
 
 Watch = Callable[[str], Progress]
@@ -81,7 +82,7 @@ class Identification:
             table = read_source(self.given)
             write_table(folder / "records.csv", {table.header(name): table.raw(name) for name in table.names})
             config = config.model_copy(update={"records": str(folder / "records.csv")})
-        write_whole(folder / "config.yaml", dump_identify_config(config, folder))
+        write_whole(folder / "config.yaml", config.to_yaml(folder))
         write_outputs(self, folder)
 
     def nominal(self) -> dict[str, float]:
@@ -133,14 +134,48 @@ def identify(
         outcomes[method] = run_method(method, measured, config, None if watch is None else watch(method))
         if path is not None:
             save_outcome(path, outcomes[method], facts)
-    counts = count_study(config, mechanism)
-    results, arrays = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
+    results, arrays = _judged(config, measured, outcomes)
+    results["counts"] = count_study(config, mechanism)
     if elsewhere is not None:
         results["transfer"] = transferred(config, elsewhere, next(iter(outcomes.values())).values[0])
     return Identification(config, measured, outcomes, results, arrays, given)
 
 
-def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: dict[str, Outcome]) -> Tensor | None:
+def _judged(
+    config: IdentifyConfig, measured: Measured, outcomes: Mapping[str, Outcome]
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The content of `identified.json`, and tensors by name for the pictures."""
+    selection, first = select(measured, config), config.methods[0]
+    found = {name: judged(config, measured, selection, name, outcome) for name, outcome in outcomes.items()}
+    resampled = _bootstrap(config, measured, outcomes)
+    results, arrays = assemble(config, measured, selection, found, _given_noise(config, measured), (), resampled)
+    results["promise"] = promised(measured, found[first])
+    one = outcomes[first].machines[:1]
+    arrays |= residuals_of(pieces_of(measured, config, is_apart(first, config), one), selection, outcomes[first])
+    arrays["observed"] = measured.rows.observed[:1]
+    arrays |= {f"observed_leg{leg}": rows.observed[:1] for leg, rows in measured.leg_rows.items()}
+    if measured.truth is None:
+        return results, arrays
+    arrays["truth"] = measured.truth
+    for name, one_found in found.items():
+        block, more = beside_truth(config, measured, selection, name, one_found)
+        results["methods"][name] |= block
+        arrays |= more
+    results["compensation"] = results["methods"][first]["compensation"]
+    error = map_error(measured, measured.start, torch.arange(measured.machines))
+    if measured.map is not None and error is not None:
+        arrays |= {"map": measured.map, "map_before": error}
+    return results, arrays
+
+
+def _given_noise(config: IdentifyConfig, measured: Measured) -> float | None:
+    if config.noise is None or measured.pose_noise is None:
+        return None
+    lengths = torch.tensor([c.unit == "m" for c in measured.mechanism.pose])
+    return float(measured.pose_noise[lengths].square().sum().sqrt())
+
+
+def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: Mapping[str, Outcome]) -> Tensor | None:
     """Standard deviations of the first machine's parameters over resampled fits, `k` [SI]; None where not asked for."""
     if config.bootstrap == 0:
         return None

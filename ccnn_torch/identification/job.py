@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.identification import Progress
-from ccnn_torch.identification.config import IdentifyConfig, dump_identify_config, load_identify_config
+from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import Identification, identify
 from ccnn_torch.identification.outputs import RESULTS, write_outputs
 from ccnn_torch.identification.page.tables import not_settled, print_identified
@@ -24,7 +24,7 @@ def start_identification(config: IdentifyConfig, quiet: bool = False) -> Path:
     """
     with RunFolder.fresh(config.out, config.name, "ccnn identify --resume") as folder:
         try:
-            folder.write("config.yaml", dump_identify_config(config, folder.path))
+            folder.write("config.yaml", config.to_yaml(folder.path))
             _run(config, folder.path, quiet)
         except InputError:
             # Nothing was computed: the next try may take the same name.
@@ -45,7 +45,7 @@ def resume_identification(path: Path, quiet: bool = False) -> Path:
         note(f"{path} is finished; nothing to do", quiet)
         return path
     with RunFolder.existing(path, "ccnn identify") as folder:
-        config = load_identify_config(folder.config)
+        config = IdentifyConfig.from_file(folder.config)
         refuse_changes(sorted(path.glob("methods/*.safetensors")), facts_of(config), folder.config)
         _run(config, path, quiet)
     return path

@@ -8,7 +8,7 @@ from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.page.report import write_identified_report
 from ccnn_torch.identification.page.tables import identified_markdown, write_identified_csv
-from ccnn_torch.mechanisms.files.write_machine import write_machine
+from ccnn_torch.mechanisms.files.write_arm import write_machine
 from ccnn_torch.report.arrays import ARRAYS_FILE, save_tensors
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.results.identified import IdentifiedResults

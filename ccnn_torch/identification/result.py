@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,6 @@ from ccnn_torch.identification.solve import (
     is_apart,
     knowledge_of,
     pieces_of,
-    select,
 )
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.verification.promise import configurations, promise_block
@@ -74,78 +73,72 @@ def known_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> Known:
     return Known(sd, combinations, correlation, singular, torch.stack(noise).mean(0), torch.stack(freedom).sum(0))
 
 
+@dataclass(frozen=True)
+class Found:
+    """What one method found of `r` machines, and how far held-out rows are from it.
+
+    Attributes:
+        outcome: what it found.
+        known: what is known of the parameters there.
+        before, after: pose errors of the held-out rows at the start and at the result, `r x t`.
+        noise: pose errors of the measurement alone, where they are known, `r x t`.
+        per_leg: whether each leg was identified from its own equations.
+    """
+
+    outcome: Outcome
+    known: Known
+    before: PoseError
+    after: PoseError
+    noise: PoseError | None = None
+    per_leg: bool = False
+
+
+def judged(config: IdentifyConfig, measured: Measured, selection: Selection, method: str, outcome: Outcome) -> Found:
+    """A method's outcome judged on the held-out rows."""
+    machines, apart, noise = outcome.machines, is_apart(method, config), noise_of_test(measured)
+    return Found(
+        outcome,
+        known_of(pieces_of(measured, config, apart, machines, outcome.values), selection, outcome.values),
+        predicted(measured, measured.start[machines], machines),
+        predicted(measured, outcome.values, machines),
+        None if noise is None else part_of_error(noise, machines),
+        apart,
+    )
+
+
+def part_of_error(error: PoseError, machines: Tensor | int) -> PoseError:
+    """The pose errors of some machines, or of one."""
+    return PoseError(error.position[machines], None if error.rotation is None else error.rotation[machines])
+
+
 def assemble(
     config: IdentifyConfig,
     measured: Measured,
-    outcomes: Mapping[str, Outcome],
-    counts: list[dict[str, Any]],
+    selection: Selection,
+    found: Mapping[str, Found],
+    noise: float | None = None,
+    notes: Sequence[str] = (),
     resampled: Tensor | None = None,
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The content of `identified.json`, and tensors by name for the pictures; the first method's values are the result.
+    """What `identified.json` has of every identification, and tensors by name for the pictures.
 
-    Not the method of the best held-out error: that would choose by the rows that judge.
+    The first method's values are the result. Not those of the method of the best held-out error: that would choose by
+    the rows that judge.
 
     Args:
-        outcomes: by method, in the config's order.
-        counts: the study of the number of poses, as `count_study` gives it.
+        found: by method, in the config's order.
+        noise: of a measured position, where the config names it, all coordinates together [m].
+        notes: sentences beside those of the rows and of the methods.
         resampled: standard deviations of the bootstrap, `k` [SI].
     """
-    selection = select(measured, config)
-    first, main = next(iter(outcomes.items()))
-    noise = noise_of_test(measured)
-    blocks: dict[str, Any] = {}
-    arrays: dict[str, Tensor] = {"start": measured.start}
-    known: dict[str, Known] = {}
-    for method, outcome in outcomes.items():
-        pieces = pieces_of(measured, config, is_apart(method, config), outcome.machines, outcome.values)
-        known[method] = known_of(pieces, selection, outcome.values)
-        blocks[method] = _method_block(config, measured, method, outcome, known[method], selection, arrays)
-    before = predicted(measured, measured.start[main.machines], main.machines)
-    after = predicted(measured, main.values, main.machines)
-    arrays |= _pose_arrays(before, after, noise)
-    arrays |= _residuals(pieces_of(measured, config, is_apart(first, config), main.machines[:1]), selection, main)
-    if measured.truth is not None:
-        arrays["truth"] = measured.truth
-    if measured.map is not None:
-        arrays["map"] = measured.map
-        error = map_error(measured, measured.start, torch.arange(measured.machines))
-        if error is not None:
-            arrays["map_before"] = error
-    arrays["correlation"] = known[first].correlation
-    arrays["observed"] = measured.rows.observed[:1]
-    arrays |= {f"observed_leg{leg}": rows.observed[:1] for leg, rows in measured.leg_rows.items()}
-    results = results_of(
-        config,
-        measured,
-        parameter_blocks(measured, selection, main, known[first], resampled),
-        known[first],
-        blocks,
-        _doubts(config, measured, blocks[first]["test"], known[first]),
-        [f"{m}: {o.message}" for m, o in outcomes.items() if o.message],
-    )
-    results |= {"promise": _promise(measured, before, after), "counts": counts}
-    return results, arrays
-
-
-def results_of(
-    config: IdentifyConfig,
-    measured: Measured,
-    parameters: dict[str, Any],
-    known: Known,
-    methods: dict[str, Any],
-    doubts: list[str],
-    notes: list[str],
-) -> dict[str, Any]:
-    """What `identified.json` has of every identification.
-
-    Args:
-        parameters: see `parameter_blocks`.
-        known: by the first method.
-        methods: their blocks; the first is the result.
-        doubts, notes: sentences, the notes beside those of the rows.
-    """
-    method, first = next(iter(methods.items()))
-    return {
+    method, first = next(iter(found.items()))
+    blocks = {name: _method_block(measured, one) for name, one in found.items()}
+    test, known = blocks[method]["test"], first.known
+    # Of a simulated machine the noise is what it is: there only the held-out error is judged.
+    given, position = config.noise is not None, test["position"] or {}
+    doubts = doubts_of(test, float(known.noise[0]), float(known.freedom[0]), position.get("noise", noise), given)
+    messages = [f"{name}: {one.outcome.message}" for name, one in found.items() if one.outcome.message]
+    results = {
         "name": config.name,
         "seed": config.seed,
         "mechanism": measured.mechanism.name,
@@ -157,33 +150,40 @@ def results_of(
             "test": measured.test.joints.shape[1],
         },
         "method": method,
-        "parameters": parameters,
+        "parameters": _parameters(measured, selection, first, resampled),
         "combinations_not_identifiable": known.combinations,
-        "test": first["test"],
-        "methods": methods,
-        "compensation": first["compensation"],
+        "test": test,
+        "methods": blocks,
+        "compensation": None,
         "singular_values": known.singular_values,
         "noise_ratio": figures({"value": known.noise}),
         "doubts": doubts,
         "counts": [],
         "paper": config.paper,
         "data_sha256": measured.data_hash or None,
-        "notes": [*measured.notes, *notes],
+        "notes": [*measured.notes, *messages, *notes],
         "versions": {
             "ccnn_torch": __version__,
             "python": platform.python_version(),
             "torch": torch.__version__,
         },
     }
+    arrays = {"start": measured.start, "correlation": known.correlation}
+    arrays |= {f"values_{name}": one.outcome.values for name, one in found.items()}
+    errors = {"before": first.before, "after": first.after} | ({} if first.noise is None else {"noise": first.noise})
+    for when, error in errors.items():
+        arrays |= {f"{part}_{when}": each for part, each in error._asdict().items() if each is not None}
+    return results, arrays
 
 
-def method_of(outcome: Outcome, test: dict[str, Any], per_leg: bool) -> dict[str, Any]:
+def _method_block(measured: Measured, found: Found) -> dict[str, Any]:
     """A method's block, without what only simulated machines show."""
+    outcome = found.outcome
     return {
-        "test": test,
+        "test": before_and_after(found.before, found.after, found.noise),
         "seconds": outcome.seconds,
         "machines": len(outcome.machines),
-        "per_leg": per_leg,
+        "per_leg": found.per_leg,
         "converged": float(outcome.converged.double().mean()),
         "evaluations": outcome.evaluations,
         "deviations": None,
@@ -193,70 +193,39 @@ def method_of(outcome: Outcome, test: dict[str, Any], per_leg: bool) -> dict[str
     }
 
 
-def _promise(measured: Measured, before: PoseError, after: PoseError) -> dict[str, Any] | None:
+def promised(measured: Measured, found: Found) -> dict[str, Any] | None:
     """What the held-out rows promise for new ones; None with several machines, of which only one is written."""
     if measured.machines > 1:
         return None
-    first, last = (
-        PoseError(error.position[0], None if error.rotation is None else error.rotation[0]) for error in (before, after)
-    )
-    return promise_block(first, last, configurations(measured.test.joints[0], measured.mechanism.joints))
+    before, after = part_of_error(found.before, 0), part_of_error(found.after, 0)
+    return promise_block(before, after, configurations(measured.test.joints[0], measured.mechanism.joints))
 
 
-def _doubts(config: IdentifyConfig, measured: Measured, test: dict[str, Any], known: Known) -> list[str]:
-    """Of a simulated machine the noise is what it is: there only the held-out error is judged."""
-    noise = None if test["position"] is None else test["position"].get("noise")
-    given = config.noise is not None and measured.pose_noise is not None
-    if given and measured.pose_noise is not None:
-        lengths = torch.tensor([c.unit == "m" for c in measured.mechanism.pose])
-        noise = float(measured.pose_noise[lengths].square().sum().sqrt())
-    return doubts_of(test, float(known.noise[0]), float(known.freedom[0]), noise, given)
-
-
-def _method_block(
-    config: IdentifyConfig,
-    measured: Measured,
-    method: str,
-    outcome: Outcome,
-    known: Known,
-    selection: Selection,
-    arrays: dict[str, Tensor],
-) -> dict[str, Any]:
-    machines = outcome.machines
-    before = predicted(measured, measured.start[machines], machines)
-    after = predicted(measured, outcome.values, machines)
-    noise = noise_of_test(measured)
-    test = before_and_after(before, after, None if noise is None else PoseError(*(_of(n, machines) for n in noise)))
-    block = method_of(outcome, test, is_apart(method, config))
-    arrays[f"values_{method}"] = outcome.values
-    if measured.truth is None:
-        return block
+def beside_truth(
+    config: IdentifyConfig, measured: Measured, selection: Selection, method: str, found: Found
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What simulated machines show of a method: entries of its block, and tensors by name."""
+    outcome, machines = found.outcome, found.outcome.machines
+    assert measured.truth is not None
     truth = measured.truth[machines]
     gap = free_values(selection, outcome.values - truth)
-    pieces = pieces_of(measured, config, is_apart(method, config), machines, truth)
+    pieces = pieces_of(measured, config, found.per_leg, machines, truth)
     bound = known_of(pieces, selection, truth).sd
-    arrays[f"deviation_{method}"], arrays[f"bound_{method}"] = gap, bound
-    block["deviations"] = _deviations(selection, gap, free_values(selection, truth - measured.start[machines]))
+    block: dict[str, Any] = {
+        "deviations": _deviations(selection, gap, free_values(selection, truth - measured.start[machines]))
+    }
     identifiable = torch.isfinite(bound).all(0)
     if bool(identifiable.any()):
         ratio = (gap / bound)[:, identifiable].square().mean(0).sqrt()
         block["bound"] = {"median": float(ratio.median()), "lowest": float(ratio.min()), "highest": float(ratio.max())}
-        inside = (gap.abs() <= Z95 * known.sd)[:, identifiable]
+        inside = (gap.abs() <= Z95 * found.known.sd)[:, identifiable]
         block["coverage"] = float(inside.double().mean())
-    found = commanded(measured, outcome.values, machines)
-    if found is not None:
-        block["compensation"] = {
-            "exact": removed(found.before, found.exact),
-            "linear": removed(found.before, found.linear),
-        }
+    sent = commanded(measured, outcome.values, machines)
+    if sent is not None:
+        block["compensation"] = {name: removed(sent.before, getattr(sent, name)) for name in ("exact", "linear")}
+    arrays = {f"deviation_{method}": gap, f"bound_{method}": bound}
     error = map_error(measured, outcome.values, machines)
-    if error is not None:
-        arrays[f"map_{method}"] = error
-    return block
-
-
-def _of(table: Tensor | None, machines: Tensor) -> Tensor:
-    return torch.empty(0) if table is None else table[machines]
+    return block, arrays if error is None else arrays | {f"map_{method}": error}
 
 
 def _deviations(selection: Selection, gap: Tensor, error: Tensor) -> dict[str, Any]:
@@ -272,19 +241,13 @@ def _deviations(selection: Selection, gap: Tensor, error: Tensor) -> dict[str, A
     return answer
 
 
-def parameter_blocks(
-    measured: Measured,
-    selection: Selection,
-    outcome: Outcome,
-    known: Known,
-    resampled: Tensor | None = None,
-) -> dict[str, Any]:
+def _parameters(measured: Measured, selection: Selection, found: Found, resampled: Tensor | None) -> dict[str, Any]:
     """Every parameter of the mechanism; one that is not free has its nominal value and no interval.
 
     A machine on which the method did not converge has no interval either; where it converged on none, nothing is
     identified.
     """
-    settled = outcome.converged
+    outcome, known, settled = found.outcome, found.known, found.outcome.converged
     place = {name: i for i, group in enumerate(selection.groups) for name in group}
     answer: dict[str, Any] = {}
     for column, parameter in enumerate(measured.mechanism.geometry):
@@ -315,17 +278,7 @@ def parameter_blocks(
     return answer
 
 
-def _pose_arrays(before: PoseError, after: PoseError, noise: PoseError | None) -> dict[str, Tensor]:
-    found = {"before": before, "after": after} | ({} if noise is None else {"noise": noise})
-    return {
-        f"{part}_{when}": values
-        for when, error in found.items()
-        for part, values in error._asdict().items()
-        if values is not None
-    }
-
-
-def _residuals(pieces: list[Piece], selection: Selection, outcome: Outcome) -> dict[str, Tensor]:
+def residuals_of(pieces: list[Piece], selection: Selection, outcome: Outcome) -> dict[str, Tensor]:
     """Whitened residuals of the first machine at the start and at the result, `s x c` for each piece."""
     names = [p.name for p in selection.parameters]
     found = free_values(selection, outcome.values[:1])

@@ -103,12 +103,6 @@ def pieces_of(
 def _problem(
     measured: Measured, config: IdentifyConfig, rows: Rows, machines: Tensor, per_leg: bool, near: Tensor | None
 ) -> Problem:
-    start = measured.start[machines]
-    problem = _problem_at(measured, config, rows, start if near is None else near, per_leg)
-    return replace(problem, start=select(measured, config).start[machines])
-
-
-def _problem_at(measured: Measured, config: IdentifyConfig, rows: Rows, start: Tensor, per_leg: bool) -> Problem:
     forward = config.residual == "forward" or (
         config.residual == "auto"
         and (isinstance(measured.mechanism, SerialArm) or config.frame.base or config.frame.tool)
@@ -118,7 +112,10 @@ def _problem_at(measured: Measured, config: IdentifyConfig, rows: Rows, start: T
             "methods: a pose depends on all legs, so legs are identified apart only by their joints; write "
             "residual=inverse, or remove _per_leg"
         )
-    return _built(measured, config, rows, choice_of(config, measured.mechanism), start, None if forward else per_leg)
+    start = measured.start[machines] if near is None else near
+    choice = choice_of(config, measured.mechanism)
+    problem = _built(measured, config, rows, choice, start, None if forward else per_leg)
+    return replace(problem, start=select(measured, config).start[machines])
 
 
 def _built(

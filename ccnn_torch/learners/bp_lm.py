@@ -9,8 +9,6 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.masked_network import MaskedNetwork
-from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.refinement import (
     finish_refinement,
@@ -27,7 +25,7 @@ from ccnn_torch.evolution.refinement_state import (
     part_of_state,
     put_part,
 )
-from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
+from ccnn_torch.learners.one_network import OneNetwork
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
 
@@ -68,7 +66,7 @@ class BPLMSettings:
             raise ValueError(f"tolerance={self.tolerance} must be above 0")
 
 
-class BPLM:
+class BPLM(OneNetwork):
     """Levenberg-Marquardt with Bayesian regularisation (`evolution.refinement`); a step is an iteration of all starts.
 
     The Jacobian is in closed form (`evolution._gauss_newton`), which is faster than `torch.func` and compared with it
@@ -173,26 +171,6 @@ class BPLM:
         """Iterations at most."""
         return self.settings.iterations
 
-    def predict(self, inputs: Tensor) -> Tensor:
-        """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
-        masks, weights = self._model()
-        return forward(masks, weights, inputs.unsqueeze(1)).squeeze(1)
-
-    def variance(self, inputs: Tensor) -> Tensor:
-        """Predictive variance of newly measured outputs. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
-        masks, weights = self._model()
-        return spread_variance([m[:, 0] for m in masks], [w[:, 0] for w in weights], self._spread(), inputs)
-
-    def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Masks and weights of one repeat's model: `out x in` and `out x (in + 1)`, biases last."""
-        masks, weights = self._model()
-        return [mask[repeat, 0] for mask in masks], [weight[repeat, 0] for weight in weights]
-
-    def network(self, repeat: int) -> MaskedNetwork:
-        """The model of one repeat."""
-        spread = self._spread()
-        return MaskedNetwork(*self.genome(repeat), spread.factors[repeat], spread.noise[repeat])
-
     def state_dict(self) -> dict[str, Tensor]:
         """The networks with their precisions, `r x restarts x ...`, and what is known of each."""
         leading = self._evidence.shape
@@ -217,9 +195,6 @@ class BPLM:
     def _model(self) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of the model, `r x 1 x ...`."""
         return self._masks, [layer.unsqueeze(1) for layer in self._problem.network.split(self._best)]
-
-    def _spread(self) -> Spread:
-        return readout_spread(*self._model(), self._data.inputs, self._data.targets, self._data.weights)
 
 
 def _nguyen_widrow(sizes: tuple[int, ...], seeds: Tensor, restarts: int) -> list[Tensor]:

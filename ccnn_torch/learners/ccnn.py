@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.bundle import averaged, without_waves
-from ccnn_torch.evolution.coevolution import density, diversity
-from ccnn_torch.evolution.evaluation import make_task
+from ccnn_torch.evolution.coevolution import REPRESENTATIVES, density, diversity
+from ccnn_torch.evolution.evaluation import EPSILON, make_task
 from ccnn_torch.evolution.harmonics import Harmonics, fit_harmonics, harmonic_count
 from ccnn_torch.evolution.masked_network import MaskedNetwork
 from ccnn_torch.evolution.network import forward
@@ -206,7 +206,7 @@ class CCNN:
     def _evolved(self) -> bool:
         settings = self.settings
         states = [structure.state for structure in self._structures]
-        errors = torch.stack([1 / state.best_fitness - settings.epsilon for state in states])
+        errors = torch.stack([1 / state.best_fitness - EPSILON for state in states])
         reached = settings.target_error > 0 and bool((errors <= settings.target_error).all())
         return reached or states[0].generation >= settings.generations
 
@@ -245,7 +245,7 @@ class CCNN:
         judged = torch.zeros(len(self._data.seeds), dtype=torch.float64, device=self._data.inputs.device)
         for structure in self._structures:
             layers = len(structure.state.populations)
-            joined = (structure.state.generation + 1) * layers * settings.population * (settings.representatives + 1)
+            joined = (structure.state.generation + 1) * layers * settings.population * (REPRESENTATIVES + 1)
             judged = judged + joined * settings.members + structure.by_repeat(structure.passes).sum(1)
         fitness = torch.stack([scores.mean(-1) for scores in first.state.fitness], -1)
         return {

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -17,13 +15,11 @@ from ccnn_torch.evolution.breeding import (
     with_elites,
 )
 from ccnn_torch.evolution.coevolution import density, diversity
-from ccnn_torch.evolution.evaluation import fitness, make_task, network_errors
+from ccnn_torch.evolution.evaluation import EPSILON, fitness, make_task, network_errors
 from ccnn_torch.evolution.genome import Genome, select
-from ccnn_torch.evolution.masked_network import MaskedNetwork
-from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import uniform_parts
-from ccnn_torch.evolution.settings import check_evolution
-from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
+from ccnn_torch.evolution.settings import ENNSettings
+from ccnn_torch.learners.one_network import OneNetwork
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
 
@@ -31,57 +27,7 @@ from ccnn_torch.learners.rows import mean_square, usable_rows
 _GENERATIONS, _FIRST = 0, 1
 
 
-@dataclass(frozen=True)
-class ENNSettings:
-    """Settings of the ENN, named as those of the CCNN. Paper 000 gives none for its ENN: probabilities are its CCNN's.
-
-    Attributes:
-        hidden: nodes of each hidden layer, those of the paper's CCNN.
-        population: networks. With `generations`, as many are evaluated as joined networks of the paper's CCNN (116,000:
-            80 individuals of three layers, each in four networks, over 120 generations).
-        generations: generations.
-        crossover: probability that a pair of parents is crossed.
-        structural_mutation: probability that a bit of a structural offspring flips.
-        weight_mutation: probability that a weight of a weight offspring mutates; one of each layer always does.
-        tournament: contestants of one tournament.
-        crossover_kind: point (cuts at random places of every layer) or uniform.
-        cuts: cut points of a point crossover in each layer; 1 = single-point.
-        elites: networks that survive unchanged.
-        weight_range: weights start and mutate in -weight_range .. weight_range.
-        density: share of connections that exist at the start. With nothing to learn, 0.2 costs less than 0.5 (1.02 to
-            1.05 of the constant's error), and where there is something it makes no difference.
-        bias: whether nodes have a bias, an input that is always on.
-        epsilon: added to the error in eq. 11, on standardised outputs.
-        nonuniform_exponent: b of eq. 13.
-        target_error: end once the training error of eq. 11 (standardised) of every repeat is at most this; 0 = never.
-
-    Raises:
-        ValueError: a value out of its range, in one sentence with the key.
-    """
-
-    hidden: tuple[int, ...] = (6, 6)
-    population: int = 320
-    generations: int = 360
-    crossover: float = 0.72
-    structural_mutation: float = 0.0015
-    weight_mutation: float = 0.0025
-    tournament: int = 3
-    crossover_kind: Literal["point", "uniform"] = "point"
-    cuts: int = 2
-    elites: int = 2
-    weight_range: float = 2.0
-    density: float = 0.2
-    bias: bool = True
-    epsilon: float = 1e-6
-    nonuniform_exponent: float = 2.0
-    target_error: float = 0.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden", tuple(self.hidden))
-        check_evolution(self)
-
-
-class ENN:
+class ENN(OneNetwork):
     """The CCNN's genomes, operators and fitness (eq. 11) without its cooperation; a step is one generation.
 
     An individual is a whole network: its layers have the same parents, and one number is its fitness. The model is the
@@ -143,7 +89,7 @@ class ENN:
     def finished(self) -> bool:
         """True after the last generation, or once every repeat has reached the target error."""
         settings = self.settings
-        error = 1 / self._best_fitness - settings.epsilon
+        error = 1 / self._best_fitness - EPSILON
         reached = settings.target_error > 0 and bool((error <= settings.target_error).all())
         return reached or self._generation >= settings.generations
 
@@ -151,26 +97,6 @@ class ENN:
     def steps(self) -> int:
         """Generations."""
         return self.settings.generations
-
-    def predict(self, inputs: Tensor) -> Tensor:
-        """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
-        masks, weights = self._model()
-        return forward(masks, weights, inputs.unsqueeze(1)).squeeze(1)
-
-    def variance(self, inputs: Tensor) -> Tensor:
-        """Predictive variance of newly measured outputs. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
-        masks, weights = self._model()
-        return spread_variance([m[:, 0] for m in masks], [w[:, 0] for w in weights], self._spread(), inputs)
-
-    def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`."""
-        masks, weights = self._model()
-        return [mask[repeat, 0] for mask in masks], [weight[repeat, 0] for weight in weights]
-
-    def network(self, repeat: int) -> MaskedNetwork:
-        """The model of one repeat, pruned of its dead nodes."""
-        spread = self._spread()
-        return MaskedNetwork(*self.genome(repeat), spread.factors[repeat], spread.noise[repeat])
 
     def state_dict(self) -> dict[str, Tensor]:
         """The population with its fitness, and the fittest network so far."""
@@ -193,7 +119,7 @@ class ENN:
 
     def _judge(self) -> None:
         """Fitness of the population, and the best network where one beats it."""
-        self._fitness = fitness(network_errors(self._layers, self._task), self.settings.epsilon)
+        self._fitness = fitness(network_errors(self._layers, self._task))
         highest, which = self._fitness.max(-1, keepdim=True)
         better = highest > self._best_fitness.unsqueeze(-1)
         take = better[..., None, None]
@@ -207,6 +133,3 @@ class ENN:
     def _model(self) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of the model, one a layer, `r x 1 x ...`."""
         return [layer.mask for layer in self._best], [layer.weight for layer in self._best]
-
-    def _spread(self) -> Spread:
-        return readout_spread(*self._model(), self._data.inputs, self._data.targets, self._data.weights)

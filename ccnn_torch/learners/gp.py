@@ -1,28 +1,23 @@
 """Exact Gaussian process regression: what a practitioner would try first on a few hundred rows.
 
-Wrapped from GPyTorch rather than from scikit-learn. GPyTorch's kernels, priors and constraints take leading batch
-dimensions, so that all repeats and outputs, each with hyperparameters of its own, go through one call; they
-differentiate by autograd, and they leave the steps to the caller, here to the trainer with its early stopping and its
-checkpoints. scikit-learn's `fit` is one process at a time, one length scale set for all outputs, in a loop of its own.
+All repeats and outputs, each with hyperparameters of its own, go through one call, and the steps are the trainer's,
+with its early stopping and its checkpoints. scikit-learn's `fit` is one process at a time, in a loop of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
-from ccnn_torch.learners.gp_posterior import GPNetwork, covariance, spread_factor
+from ccnn_torch.learners.gaussian_process import GPNetwork, covariance, log_evidence, spread_factor
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import usable_rows
 from ccnn_torch.numerics.blocks import block_size
-
-if TYPE_CHECKING:
-    from ccnn_torch.learners.gp_evidence import GPPrior
 
 # Numbers in one matrix worked on at a time: what fits into the processor's cache is several times faster than one
 # batch of everything.
@@ -117,8 +112,6 @@ class GaussianProcess:
         Raises:
             MethodFailedError: a training row is not finite.
         """
-        from ccnn_torch.learners.gp_evidence import GPPrior
-
         settings, data = self.settings, usable_rows(data)
         r, _, i = data.inputs.shape
         o = data.targets.shape[-1]
@@ -131,7 +124,6 @@ class GaussianProcess:
         self._mean = (data.targets * shares).sum(1)
         self._variance = ((data.targets - self._mean.unsqueeze(1)).square() * shares).sum(1)
         self._few = min(settings.hyperparameter_rows, order.shape[1])
-        self._process: GPPrior = GPPrior(settings.kernel, i, settings.noise_floor).to(data.inputs.device)
         start = self._rows.new_zeros(r, o, i + 3)
         start[..., :i], start[..., i + 1] = _SMOOTH, _NOISY
         empty = start.new_full((r, o), -torch.inf)
@@ -163,15 +155,13 @@ class GaussianProcess:
 
     def step(self) -> dict[str, Tensor]:
         """One marginal likelihood of every output whose search has not ended, and one step of Rprop."""
-        from ccnn_torch.learners.gp_evidence import log_evidence
-
-        state = self._state
+        state, settings = self._state, self.settings
         slope = torch.zeros_like(state["theta"])
         weights = self._weights[:, : self._few]
         going = ~state["done"]
         for rows, outputs in self._chunks(going):
             few = self._rows[rows, : self._few], self._targets[rows, outputs, : self._few], weights[rows]
-            found = log_evidence(self._process, state["theta"][rows, outputs], *few)
+            found = log_evidence(settings.kernel, settings.noise_floor, state["theta"][rows, outputs], *few)
             slope[rows, outputs] = found.slope
             better = found.value > state["best"][rows, outputs]
             error = (found.residual.square() * few[2]).sum(-1) / few[2].sum(-1)

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.ccnn import CCNN
 from ccnn_torch.learners.constant import Constant
-from ccnn_torch.learners.enn import ENN, ENNSettings
+from ccnn_torch.learners.enn import ENN
 from ccnn_torch.learners.gp import GaussianProcess, GPSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.learners.protocol import Learner, missing_verbs

@@ -129,7 +129,7 @@ class Structure:
             for mask, weight in zip(plain.masks, plain.weights, strict=True)
         )
         errors = joined_errors(0, genomes[0], genomes, self.rows.task)[:, 0, 0]
-        self.state = keep_refined(self.state, genomes, fitness(errors, self.settings.epsilon))
+        self.state = keep_refined(self.state, genomes, fitness(errors))
 
     def search_waves(self) -> None:
         """Look for periodic nodes in what the kept members of a repeat leave, and refine those that got any."""

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import newton as _numeric
-from ccnn_torch.mechanisms.inverse_kinematics import InverseKinematics
 from ccnn_torch.mechanisms.pose import (
     PoseError,
     coordinates_jacobian,
@@ -24,6 +23,29 @@ from ccnn_torch.mechanisms.pose import (
 )
 from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, wrap_angle
+
+
+class InverseKinematics(nn.Module):
+    """The module that torch forward hooks sit on; it only calls `solve_inverse` of its mechanism."""
+
+    def __init__(self, solve_inverse: Callable[..., Tensor]) -> None:
+        super().__init__()
+        # A bound method, not the mechanism: a child that holds its parent as a submodule would never end.
+        self._solve = solve_inverse
+
+    def forward(
+        self,
+        pose: Tensor,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+        covariates: Tensor | None = None,
+        **ignored: object,
+    ) -> Tensor:
+        """Joints of a pose, as `Mechanism.solve_inverse`.
+
+        `covariates` and further keywords are there for the hooks: the nominal kinematics do not depend on them.
+        """
+        return self._solve(pose, parameters, guess)
 
 
 class Mechanism(nn.Module):

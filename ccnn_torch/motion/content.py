@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, Draws, Gap
 from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
 from ccnn_torch.display import number_text
 from ccnn_torch.effects.words import words_of
+from ccnn_torch.evidence.shrink import INTERVAL, Draws, Gap
 from ccnn_torch.motion.effects import Facts, Number
 from ccnn_torch.motion.form import deviations
 from ccnn_torch.motion.judge import AxisVerdict

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.progress import at_step
-from ccnn_torch.diagnosis.shrink.held_out import draws
 from ccnn_torch.diagnosis.verdict.text import verdict_text
+from ccnn_torch.evidence.shrink import draws
 from ccnn_torch.motion.content import effects_of, floor_of, hidden_of, notes_of, where_is
 from ccnn_torch.motion.effects import motion_effects
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, fit_sets, grams_of
+from ccnn_torch.evidence.marginal_likelihood import Fits, fit_sets, grams_of
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.spec import Fit, Spec
 from ccnn_torch.motion.whiten import Whitening

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.dictionary import CERTAIN
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, scaled
-from ccnn_torch.diagnosis.search.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_variance
+from ccnn_torch.evidence.dictionary import CERTAIN
+from ccnn_torch.evidence.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_variance
+from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, scaled
 from ccnn_torch.motion.effects import EXACT
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.spec import Fit

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.shrink.held_out import Draws, Gap, HeldOut, shrink_of
+from ccnn_torch.evidence.shrink import Draws, Gap, HeldOut, shrink_of
 from ccnn_torch.motion.fit import fit_many
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library

@@ -105,11 +105,6 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     return files
 
 
-def is_identified(path: Path) -> bool:
-    """Whether a file is one that `ccnn diagnose --motion` writes for commands to be corrected by."""
-    return path.suffix == ".json" and path.is_file() and {"axes", "mechanism", "left"} <= {*read_json(path)}
-
-
 def load_identified(path: Path, allow_code: bool = False) -> Identified:
     """The model of a file that `ccnn diagnose --motion` has written.
 

@@ -27,8 +27,7 @@ from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
 from ccnn_torch.report.screen import say_place, stdout, step_bar
 from ccnn_torch.report.table import print_text
-from ccnn_torch.run_folder.interrupt import if_stopped
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import if_stopped, locked
 
 _STEPS = {
     "reading the records": 1.0,
@@ -66,7 +65,9 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
             _report(config, folder, results, found)
             if not quiet:
                 print_diagnosis(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
-                say_place(f"Written: {folder / RESULT}, and beside it report.html, {', '.join(written)}")
+                say_place(
+                    f"Written: {typed_path(str(folder / RESULT))}, and beside it report.html, {', '.join(written)}"
+                )
     return folder
 
 

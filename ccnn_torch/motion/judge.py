@@ -1,7 +1,7 @@
 """From fitted sets to a verdict on each axis.
 
 The forms of effects, and that of the nominal model, are those of the machine only nearly: sets are weighed again under
-a noise with their form errors in it (`diagnosis.search.form_error`). Members that take nothing away on runs that were
+a noise with their form errors in it (`evidence.form_error`). Members that take nothing away on runs that were
 not fitted are left out of a set before it counts.
 """
 
@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import torch
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets
-from ccnn_torch.diagnosis.search.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, is_same
+from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH
+from ccnn_torch.evidence.marginal_likelihood import fit_sets
 from ccnn_torch.motion.drivers import Driver, driver_columns
 from ccnn_torch.motion.form import weighed
 from ccnn_torch.motion.outside import Candidate, Members, essential, holds, prior_of, with_drivers

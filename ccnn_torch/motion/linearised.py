@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.parameter import PARAMETER
+from ccnn_torch.effects.constant import PARAMETER
 from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.fit import fit_many
 from ccnn_torch.motion.log import Log

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.simulators.mujoco_file import compiled, mujoco_spec
+from ccnn_torch.mechanisms.simulators.mujoco_model import compiled, mujoco_spec
 from ccnn_torch.motion.mujoco_motion import NONE, loaded_motion
 from ccnn_torch.motion.nominal import Nominal
 

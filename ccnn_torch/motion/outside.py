@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
+from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets, grams_of
 from ccnn_torch.motion.drivers import Driver
 from ccnn_torch.motion.fit import sensitivities, squares_unseen
 from ccnn_torch.motion.problem import Problem

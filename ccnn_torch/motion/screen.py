@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.motion.fit import sensitivities
 from ccnn_torch.motion.form import weighed
 from ccnn_torch.motion.library import Variant

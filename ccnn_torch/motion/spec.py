@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams
+from ccnn_torch.evidence.marginal_likelihood import Grams
 from ccnn_torch.motion.library import Library, Variant
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -76,6 +77,115 @@ def _pulled(value: Tensor, point: Tensor, cotangent: Tensor, create_graph: bool 
     return torch.autograd.grad(total, point, retain_graph=True, create_graph=create_graph, materialize_grads=True)[0]
 
 
+class Trial(NamedTuple):
+    """A step that was not evaluated yet, of the `b` problems still searched.
+
+    Attributes:
+        problem: which problems these are, `b`, int64.
+        point, cost: where they are, `b x k` and `b`.
+        step: `b x k`.
+        promised: fall of the cost that the linear model promises, `b`.
+        before: what it promised for the last step, `b`; 0 where that was refused, and for the first.
+        damping: `b`.
+    """
+
+    problem: Tensor
+    point: Tensor
+    cost: Tensor
+    step: Tensor
+    promised: Tensor
+    before: Tensor
+    damping: Tensor
+
+
+class Descent(NamedTuple):
+    """Where `descend` ended.
+
+    Attributes:
+        value: `b x k`.
+        cost: `b`.
+        converged: `b`, bool.
+        iterations: steps tried by the slowest problem.
+        evaluations: points evaluated, of all problems together, starts included.
+    """
+
+    value: Tensor
+    cost: Tensor
+    converged: Tensor
+    iterations: int
+    evaluations: int
+
+
+def descend(
+    evaluate: Callable[[Tensor, Tensor], tuple[Tensor, ...]],
+    step_of: Callable[..., tuple[Tensor, Tensor]],
+    settled: Callable[[Trial], Tensor],
+    start: Tensor,
+    *,
+    damping: float,
+    max_iterations: int,
+    trusting: bool = False,
+) -> Descent:
+    """Damped Gauss-Newton steps of many problems side by side, each with its own damping λ.
+
+    A trial with a worse or non-finite cost is refused and λ grows, which keeps the path inside the domain.
+
+    Args:
+        evaluate: points `b x k` and the problems that they are of -> cost `b` and the tensors of the linear model
+            there, `b x …` each.
+        step_of: those tensors and λ, `b` -> step `b x k` and the fall of the cost that it promises, `b`.
+        settled: which of the problems end with this step, `b`.
+        start: `b x k`.
+        damping: first λ.
+        max_iterations: bound on the steps tried.
+        trusting: whether the last step of a problem is taken without a look at its cost.
+
+    Returns:
+        Descent; a problem whose cost is not finite at its start stays there.
+    """
+    x = start.clone()
+    cost, *model = evaluate(x, torch.arange(len(x), device=x.device))
+    evaluations, iterations = len(x), 0
+    converged = torch.zeros_like(cost, dtype=torch.bool)
+    active = torch.nonzero(torch.isfinite(cost)).squeeze(-1)
+    model = [part[active] for part in model]
+    lam = torch.full_like(cost[active], damping)
+    before = torch.zeros_like(lam)
+    while len(active) and iterations < max_iterations:
+        iterations += 1
+        here = x[active]
+        step, promised = step_of(*model, lam)
+        trial = here + step
+        done = settled(Trial(active, here, cost[active], step, promised, before, lam))
+        if trusting and bool(done.any()):
+            last, left = active[done], ~done
+            x[last], cost[last], converged[last] = trial[done], cost[last] - promised[done], True
+            active, lam, promised, trial, done = (part[left] for part in (active, lam, promised, trial, done))
+            model = [part[left] for part in model]
+            if not len(active):
+                break
+        new_cost, *new_model = evaluate(trial, active)
+        evaluations += len(active)
+        # A rise within rounding counts as no rise: at the minimum neighbouring costs are equal to rounding.
+        better = new_cost <= cost[active] * (1 + 4 * _EPS)
+        x[active] = torch.where(better[:, None], trial, x[active])
+        cost[active] = torch.where(better, new_cost, cost[active])
+        converged[active] = done
+        lam = torch.where(better, lam / 20, lam * 8).clamp(_DAMPING_FLOOR, _DAMPING_CEILING)
+        before = torch.where(better, promised, 0.0)
+        model = [_chosen(better, new, old) for new, old in zip(new_model, model, strict=True)]
+        if bool(done.any()):
+            left = ~done
+            active, lam, before = active[left], lam[left], before[left]
+            model = [part[left] for part in model]
+    return Descent(x, cost, converged, iterations, evaluations)
+
+
+def _chosen(first: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """Problem by problem, `one` where `first` (`b`, bool) is set; both `b x …`."""
+    return torch.where(first.reshape(-1, *(1,) * (one.dim() - 1)), one, other)
+
+
 def levenberg_marquardt(
     residual: Callable[..., Tensor],
     start: Tensor,
@@ -91,7 +201,7 @@ def levenberg_marquardt(
 
     The step solves (JᵀJ + λ max diag(JᵀJ) I) s = -Jᵀr, or its dual where there are fewer residuals than unknowns: as λ
     falls this is the minimum-norm Gauss-Newton step, so that directions that the residuals do not see stay where they
-    were. A trial with a worse or non-finite residual is refused and λ grows, which keeps the path inside the domain.
+    were.
 
     Args:
         residual: `(x, *data)` -> `... x c`; treats leading dims independently.
@@ -104,86 +214,71 @@ def levenberg_marquardt(
             linear model promises is below rounding.
         damping: first λ, relative.
         both: `(x, *data)` -> residual and Jacobian at once, in the place of both functions, where they share most of
-            their work; needs data.
+            their work.
 
     Returns:
         Solution; no gradient flows through it.
     """
     lead, k = start.shape[:-1], start.shape[-1]
     count = math.prod(lead)
-    x = start.detach().reshape(count, k).clone()
+    begin = start.detach().reshape(count, k)
     rows = tuple(d.detach().expand(*lead, d.shape[-1]).reshape(count, d.shape[-1]) for d in data)
 
-    def call(function: Callable[..., Tensor], values: Tensor, active: Tensor) -> Tensor:
-        if rows:
-            return function(values, *(d[active] for d in rows))
-        everything = x.clone()
-        everything[active] = values
-        answer = function(everything.reshape(*lead, k))
-        return answer.reshape(count, *answer.shape[len(lead) :])[active]
-
-    def differentiate(values: Tensor, active: Tensor) -> Tensor:
+    def linearised(point: Tensor, *point_rows: Tensor) -> tuple[Tensor, Tensor]:
+        if both is not None:
+            return both(point, *point_rows)
         if jacobian is not None:
-            return call(jacobian, values, active)
+            return residual(point, *point_rows), jacobian(point, *point_rows)
+        return jacobian_of(lambda p: residual(p, *point_rows), point)
 
-        def by_autodiff(point: Tensor, *point_rows: Tensor) -> Tensor:
-            return jacobian_of(lambda p: residual(p, *point_rows), point)[1]
+    def evaluate(values: Tensor, active: Tensor) -> tuple[Tensor, ...]:
+        if rows:
+            value, slope = linearised(values, *(d[active] for d in rows))
+        else:
+            everything = begin.clone()
+            everything[active] = values
+            whole = linearised(everything.reshape(*lead, k))
+            value, slope = (part.reshape(count, *part.shape[len(lead) :])[active] for part in whole)
+        value, slope = value.detach(), slope.detach()
+        return value.square().sum(-1) / 2, value, slope
 
-        return call(by_autodiff, values, active)
+    def settled(trial: Trial) -> Tensor:
+        size, away = (torch.linalg.vector_norm(part, dim=-1) for part in (trial.step, trial.point))
+        done: Tensor = (size <= tolerance * (1 + away)) | (trial.promised <= _EPS * trial.cost)
+        return done
 
-    def evaluate(values: Tensor, active: Tensor) -> tuple[Tensor, Tensor | None]:
-        if both is None:
-            return call(residual, values, active).detach(), None
-        value, slope = both(values, *(d[active] for d in rows))
-        return value.detach(), slope.detach()
-
-    active = torch.arange(count, device=x.device)
-    r, slope = evaluate(x, active)
-    cost = r.square().sum(-1) / 2
-    converged = torch.zeros(count, dtype=torch.bool, device=x.device)
-    active = torch.nonzero(torch.isfinite(cost)).squeeze(-1)
-    r, slope = r[active], None if slope is None else slope[active]
-    lam = torch.full((len(active),), damping, dtype=x.dtype, device=x.device)
-    iterations = 0
-    while len(active) and iterations < max_iterations:
-        iterations += 1
-        here = x[active]
-        step, promised = _damped_step(differentiate(here, active).detach() if slope is None else slope, r, lam)
-        trial = here + step
-        trial_r, trial_slope = evaluate(trial, active)
-        trial_cost = trial_r.square().sum(-1) / 2
-        # A rise within rounding counts as no rise: at the minimum neighbouring costs are equal to rounding.
-        better = trial_cost <= cost[active] * (1 + 4 * _EPS)
-        size = torch.linalg.vector_norm(step, dim=-1)
-        done = size <= tolerance * (1 + torch.linalg.vector_norm(here, dim=-1))
-        done |= promised <= _EPS * cost[active]
-        x[active] = torch.where(better[:, None], trial, here)
-        cost[active] = torch.where(better, trial_cost, cost[active])
-        r = torch.where(better[:, None], trial_r, r)
-        if slope is not None and trial_slope is not None:
-            slope = torch.where(better[:, None, None], trial_slope, slope)[~done]
-        lam = torch.where(better, lam / 20, lam * 8).clamp(_DAMPING_FLOOR, _DAMPING_CEILING)
-        converged[active] = done
-        active, r, lam = active[~done], r[~done], lam[~done]
-    converged = converged.reshape(lead)
-    cost = cost.reshape(lead)
-    return Solution(x.reshape(start.shape), cost, iterations, converged, _message(converged, cost, max_iterations))
+    found = descend(evaluate, _least_squares_step, settled, begin, damping=damping, max_iterations=max_iterations)
+    converged, cost = found.converged.reshape(lead), found.cost.reshape(lead)
+    message = _message(converged, cost, max_iterations)
+    return Solution(found.value.reshape(start.shape), cost, found.iterations, converged, message)
 
 
-def _damped_step(j: Tensor, r: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
-    """j: `b x c x k`, r: `b x c`, lam: `b`; returns the step `b x k` and the decrease it promises, `b`."""
+def damped_step(matrix: Tensor, gradient: Tensor, ridge: Tensor) -> tuple[Tensor, Tensor]:
+    """Solve (matrix + ridge I) s = -gradient.
+
+    Args:
+        matrix: `… x k x k`, positive semidefinite.
+        gradient: `… x k`.
+        ridge: `…`.
+
+    Returns:
+        The step `… x k` and the fall of the cost that it promises, `…`.
+    """
+    damped = matrix + torch.diag_embed(ridge[..., None].expand_as(gradient))
+    step = -torch.cholesky_solve(gradient[..., None], torch.linalg.cholesky_ex(damped).L)[..., 0]
+    return step, (step * (ridge[..., None] * step - gradient)).sum(-1) / 2
+
+
+def _least_squares_step(r: Tensor, j: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
+    """r: `b x c`, j: `b x c x k`, lam: `b`; as `damped_step`."""
     c, k = j.shape[-2:]
     normal = j.mT @ j if k <= c else j @ j.mT
-    scale = normal.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-100)  # a zero Jacobian gives a zero step
-    damped = normal + torch.diag_embed((lam * scale)[:, None].expand(-1, normal.shape[-1]))
+    ridge = lam * normal.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-100)  # a zero Jacobian gives a zero step
     gradient = (j.mT @ r[..., None])[..., 0]
-    factor = torch.linalg.cholesky_ex(damped).L
     if k <= c:
-        step = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
-    else:
-        step = -(j.mT @ torch.cholesky_solve(r[..., None], factor))[..., 0]
-    promised = ((lam * scale) * step.square().sum(-1) - (step * gradient).sum(-1)) / 2
-    return step, promised
+        return damped_step(normal, gradient, ridge)
+    step = (j.mT @ damped_step(normal, r, ridge)[0][..., None])[..., 0]
+    return step, (step * (ridge[..., None] * step - gradient)).sum(-1) / 2
 
 
 def _message(converged: Tensor, cost: Tensor, max_iterations: int) -> str:

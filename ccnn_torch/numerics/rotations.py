@@ -37,15 +37,6 @@ def matrix_to_rotation_vector(matrix: Tensor) -> Tensor:
     return torch.where(small, 2 / scalar, 2 * torch.atan2(sine, scalar) / sine) * vector
 
 
-def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
-    """quaternion: `... x 4` (w, x, y, z), of any length but 0; returns `... x 3 x 3`."""
-    unit = quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
-    scalar, vector = unit[..., :1, None], unit[..., 1:]
-    k = skew(vector)
-    matrix: Tensor = torch.eye(3, dtype=unit.dtype, device=unit.device) + 2 * (scalar * k + k @ k)
-    return matrix
-
-
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     """matrix: `... x 3 x 3`; returns the unit quaternion (w, x, y, z) with w >= 0, `... x 4` (Markley 2008, eq. 8)."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))

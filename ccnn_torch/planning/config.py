@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
-from ccnn_torch.config.keys import list_keys
-from ccnn_torch.config.tree import Columns, JointMap, Names, Section, config_from_options
+from ccnn_torch.config.tree import Columns, JobConfig, JointMap, Names, Section
 
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.1 mm` or `0.03 deg`."""
 
 
-class PlannedParameters(Section):
-    """Which parameters are to be identified, by name or pattern (`A*`, `leg1.*`)."""
+class ParameterConfig(Section):
+    """Which parameters are identified, by name or pattern (`A*`, `leg1.*`)."""
 
     free: Names | None = Field(default=None, description="parameters to identify, names or patterns; null = all")
     fixed: Names = Field(default=[], description="parameters that keep their nominal value, names or patterns")
     tied: list[list[str]] = Field(default=[], description="groups of parameters with one common value")
     prior: dict[str, Size] = Field(
         default={},
-        description="standard deviation of what is known already, by name or pattern, in SI or as '0.5 mm'",
+        description="standard deviation of a Gaussian prior around the nominal value, by name or pattern, in SI or as "
+        "'0.5 mm'",
     )
 
 
-class PlanConfig(Section):
+class PlanConfig(JobConfig):
     """What `ccnn plan` accepts."""
 
     of_a_run = ("columns", "joint_map", "mechanism", "mechanism_keys", "seed")
@@ -36,7 +34,7 @@ class PlanConfig(Section):
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
     columns: Columns
     joint_map: JointMap
-    parameters: PlannedParameters = Field(default_factory=PlannedParameters)
+    parameters: ParameterConfig = Field(default_factory=ParameterConfig)
     residual: Literal["auto", "inverse", "forward"] = Field(
         default="auto",
         description="how the parameters will be identified: from joints (inverse) or poses (forward); auto = poses "
@@ -49,9 +47,6 @@ class PlanConfig(Section):
     )
     joint_noise: Size | dict[str, Size] = Field(
         default=0.0, description="standard deviation of the recorded joints, in SI or as '0.01 deg', one or by joint"
-    )
-    index: Literal["O1", "O2", "O3", "O4", "O5"] = Field(
-        default="O1", description="observability index to make large: O1 (determinant, as in the paper) to O5"
     )
     candidates: int = Field(default=100_000, ge=10, description="configurations that the poses are chosen from")
     limits: dict[str, tuple[Size, Size]] = Field(
@@ -74,21 +69,3 @@ class PlanConfig(Section):
         description="poses stay in reach of machines whose parameters are off by so many plausible errors",
     )
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the candidates")
-
-
-def load_plan_config(
-    path: Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
-) -> PlanConfig:
-    """Read a config file (defaults where there is none) and put overrides ``key.sub=value`` over it.
-
-    A config for `ccnn run`, as `ccnn new` writes it, gives its machine; `note` is called with a sentence on the others.
-
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    return config_from_options(PlanConfig, path, overrides, note)
-
-
-def describe_plan_keys() -> list[tuple[str, str, str]]:
-    """Every key, dotted, with its default and what it means."""
-    return list(list_keys(PlanConfig))

@@ -1,4 +1,4 @@
-"""Gain of each further pose, and the recommended number."""
+"""Observability of a set of poses, gain of each further pose, and the recommended number."""
 
 from __future__ import annotations
 
@@ -8,10 +8,50 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ccnn_torch.planning.observability import Observability, observability
+from ccnn_torch.errors import InputError
 
 # Successive poses of small gain before the search for more ends: single gains scatter.
 _WINDOW = 3
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Indices of an identification matrix with singular values σ1 ≥ … ≥ σk; each `...`, larger is better.
+
+    They are 0 where a direction is unobservable. The ranking of poses by O1, with any divisor, does not depend on the
+    parameters' units (Sun and Hollerbach 2008).
+
+    Attributes:
+        o1: (σ1 ⋯ σk)^(1/k) / √poses (Borm and Menq 1991).
+        o1_by_parameters: (σ1 ⋯ σk)^(1/k) / k, the divisor of paper 004.
+        o2: σk / σ1, the reciprocal condition number (Driels and Pathre 1990).
+    """
+
+    o1: Tensor
+    o1_by_parameters: Tensor
+    o2: Tensor
+
+
+def observability(jacobian: Tensor, poses: int | Tensor | None = None) -> Observability:
+    """Indices of identification matrices.
+
+    Args:
+        jacobian: derivatives of all measured channels by the parameters, `... x m x k`; rows of 0 count for nothing.
+        poses: number of poses that the rows come from, an integer or `...`; m when None (one channel a pose).
+
+    Raises:
+        InputError: no parameter.
+    """
+    m, k = jacobian.shape[-2:]
+    if k == 0:
+        raise InputError("observability needs an identification matrix with at least one column")
+    if m < k:
+        jacobian = torch.cat([jacobian, jacobian.new_zeros(*jacobian.shape[:-2], k - m, k)], dim=-2)
+    values = torch.linalg.svdvals(jacobian)
+    count = torch.as_tensor(m if poses is None else poses, dtype=jacobian.dtype)
+    mean = values.log().mean(-1).exp()
+    largest = torch.where(values[..., 0] > 0, values[..., 0], 1.0)
+    return Observability(mean / count.sqrt(), mean / k, values[..., -1] / largest)
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.config.prior_sizes import prior_sizes
-from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.config.sizes import size, sizes_of_joints, sizes_of_pose
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import make_folder, write_whole
 from ccnn_torch.identification import ParameterChoice
 from ccnn_torch.identification.problems.problem import Progress
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.planning import Plan, plan_poses
-from ccnn_torch.planning.config import PlanConfig, load_plan_config
+from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.planning.figure import plan_plot
 from ccnn_torch.planning.page import plan_markdown
 from ccnn_torch.records import write_table
@@ -43,7 +43,7 @@ def make_plan(
     Raises:
         InputError: as `load_mechanism` and `plan_poses`; a size that is invalid, or of an unknown name.
     """
-    config = config or load_plan_config(None)
+    config = config or PlanConfig.from_file(None)
     if poses < 1:
         raise InputError(f"--poses: plan at least 1 pose, not {poses}")
     machine = load_mechanism(mechanism, **config.mechanism_keys) if isinstance(mechanism, str) else mechanism
@@ -56,7 +56,6 @@ def make_plan(
         pose_noise=_pose_noise(config, machine),
         joint_noise=_joint_noise(config, machine),
         residual=config.residual,
-        index=config.index,
         candidates=config.candidates,
         limits=_limits(config, machine),
         max_condition=config.max_condition,
@@ -99,7 +98,7 @@ def write_plan(
     for coordinates, part in ((mechanism.joints, "joints"), (mechanism.pose, "pose")):
         values = torch.cat([getattr(plan, part) for plan in plans])
         columns |= {c.header: values[:, i].numpy() for i, c in enumerate(coordinates)}
-    columns |= _commands(columns, mechanism, config or load_plan_config(None))
+    columns |= _commands(columns, mechanism, config or PlanConfig.from_file(None))
     make_folder(path.parent)
     write_table(path, columns)
     plot = plan_plot(mechanism.pose, plans, least_gain)
@@ -142,11 +141,7 @@ def _pose_noise(config: PlanConfig, machine: Mechanism) -> Tensor:
 
 def _joint_noise(config: PlanConfig, machine: Mechanism) -> Tensor | None:
     """None where there is none."""
-    given, none = config.joint_noise, [0.0] * len(machine.joints)
-    if isinstance(given, dict):
-        found = sizes_by_name(given, machine.joints, "joint_noise", none)
-    else:
-        found = torch.tensor([size(given, j.unit, "joint_noise") for j in machine.joints], dtype=torch.float64)
+    found = sizes_of_joints(config.joint_noise, machine.joints, "joint_noise")
     if bool((found < 0).any()):
         raise InputError("joint_noise: a standard deviation is not negative; write e.g. joint_noise='0.01 deg', or 0")
     return found if bool((found > 0).any()) else None

@@ -51,8 +51,7 @@ def gain_table(plan: Plan, short: bool = False) -> Table:
     seen = gains.observability
     indices = {"O1": seen.o1}
     if not short:
-        others = {"O2": seen.o2, "O3": seen.o3, "O4": seen.o4, "O5": seen.o5}
-        indices |= {"O1 (by k)": seen.o1_by_parameters, **others}
+        indices |= {"O1 (by k)": seen.o1_by_parameters, "O2": seen.o2}
     rows = []
     for i in shown:
         worst = int((gains.sd[i] / plan.scale).argmax())
@@ -103,7 +102,7 @@ def plan_markdown(mechanism: str, plans: Sequence[Plan], least_gain: float, pict
     parts = [
         f"# Poses to measure: {mechanism}",
         f"Chosen from {first.candidates} configurations ({first.drawn} drawn; the others are outside the limits or too "
-        f"near to a singularity) so that {first.index} is largest. The most informative rows come first: these "
+        f"near to a singularity) so that O1 is largest. The most informative rows come first: these "
         "alone are good, too.",
         *(plan_sentence(plan, least_gain) for plan in plans),
         *filter(None, map(left_out_sentence, plans)),

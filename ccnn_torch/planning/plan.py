@@ -31,9 +31,6 @@ from ccnn_torch.planning.design import (
     tightest_bound,
 )
 from ccnn_torch.planning.gains import Gains, gains_of, gains_of_sets, recommended_count
-from ccnn_torch.planning.observability import INDICES
-from ccnn_torch.planning.other_indices import exchange_by_index
-from ccnn_torch.spelling import nearest
 
 # Draws of random poses that a plan is compared with; odd, for the median.
 _RANDOM = 101
@@ -51,9 +48,9 @@ class Choice:
         chosen: numbers of the candidates, `N`, int64; the first ones alone are good, too.
         gains: what the first n of them show, and what so many more would: `gains.count` goes beyond N.
         recommended: the number of poses after which a further one gives little; None where even the last gives more.
-        bound: share of the best possible det^(1/k) of the information that is reached at least; None for an index other
-            than O1 and where there is a prior.
-        settled: whether no exchange of a pose improves the index.
+        bound: share of the best possible det^(1/k) of the information that is reached at least; None where there is a
+            prior.
+        settled: whether no exchange of a pose improves the determinant.
         random_o1: O1 of as many candidates drawn at random, the median of 101 draws.
         random_sd: standard deviation of each parameter with them, likewise, `k` [SI].
         kept: numbers of the parameters that are planned for, `k` of the problem's; all where every one shows.
@@ -81,7 +78,6 @@ class Plan:
         scale: their plausible errors, `k` [SI].
         joints: commands for the machine, `N x n` [SI].
         pose: where they bring the nominal machine, `N x p` [SI].
-        index: the index that was maximised.
         choice: the choice and its figures.
         candidates: how many configurations there were to choose from.
         drawn: how many were drawn to find them.
@@ -93,7 +89,6 @@ class Plan:
     scale: Tensor
     joints: Tensor
     pose: Tensor
-    index: str
     choice: Choice
     candidates: int
     drawn: int
@@ -114,12 +109,11 @@ def choose_poses(
     problem: Problem,
     count: int,
     *,
-    index: str = "O1",
     repeat: bool = False,
     least_gain: float = 0.02,
     progress: Progress | None = None,
 ) -> Choice:
-    """Choose rows of a problem (its first machine) so that an observability index of the parameters is largest.
+    """Choose rows of a problem (its first machine) so that O1, the determinant of the information, is largest.
 
     Any problem can be given, so that poses are planned for constraints as well as for measured poses. If no candidate
     determines a combination of parameters, one of them is fixed, and the plan is for the others (`Choice.kept`).
@@ -128,17 +122,13 @@ def choose_poses(
     Args:
         problem: a row for every candidate.
         count: how many to choose.
-        index: `O1` … `O5`, of parameters in plausible errors and measurements in noise.
         repeat: whether a row may be chosen more than once.
         least_gain: what a further pose must give to be worth measuring, a share.
         progress: called with the share that is done.
 
     Raises:
-        InputError: too few poses or candidates, an unknown index, or no parameter shows in any candidate.
+        InputError: too few poses or candidates, or no parameter shows in any candidate.
     """
-    if index not in INDICES:
-        near = nearest(index, INDICES)
-        raise InputError(f"index: must be one of {', '.join(INDICES)}, not '{index}'" + (f"; {near}?" if near else ""))
     report = progress or (lambda _: None)
     rows = identification_rows(problem, _share(report, 0.0, 0.15))
     held = torch.where(torch.isfinite(problem.prior_sd), problem.scale / problem.prior_sd, 0.0)
@@ -150,19 +140,14 @@ def choose_poses(
     prior = turn.mT @ torch.diag(held.square()) @ turn
 
     design = make_design(rows @ turn, prior if bool((held > 0).all()) else None, repeat)
-    design_share = 0.4 if index != "O1" else 0.8
     for step in range(count):
         add_best(design)
         report(0.15 + 0.05 * (step + 1) / count)
     design.prior = prior
-    settled = exchange(design, _share(report, 0.2, design_share))
-    bound = None if bool((held > 0).any()) or index != "O1" else tightest_bound(design)
-    chosen = design.chosen
-    if index != "O1":
-        known_already = torch.diag(held.square())
-        chosen, settled = exchange_by_index(rows, chosen, known_already, index, repeat, _share(report, 0.6, 0.4))
-    order, first = order_by_worth(rows[chosen] @ turn, prior)
-    chosen = [chosen[place] for place in order]
+    settled = exchange(design, _share(report, 0.2, 0.8))
+    bound = None if bool((held > 0).any()) else tightest_bound(design)
+    order, first = order_by_worth(rows[design.chosen] @ turn, prior)
+    chosen = [design.chosen[place] for place in order]
 
     # What more poses would give: the best ones to add, one by one.
     design.chosen = list(chosen)
@@ -194,7 +179,6 @@ def plan_poses(
     choice: ParameterChoice | None = None,
     pose_noise: Noise | None = None,
     joint_noise: Noise | None = None,
-    index: str = "O1",
     candidates: int = 100_000,
     limits: Limits | None = None,
     max_condition: float = 50.0,
@@ -215,7 +199,6 @@ def plan_poses(
         choice: which parameters are to be identified, with their priors; all when None.
         pose_noise, joint_noise: standard deviations, one for all or one each [SI]; where neither is given the pose has
             1e-5 m and 1e-5 m over 0.3 m in its angles.
-        index: `O1` (determinant, the paper's) … `O5`.
         candidates: configurations to choose from.
         limits, max_condition, rotation_weight: as `draw_candidates`.
         residual: `inverse` compares joints, `forward` poses; `auto` = poses for serial arms and framed mechanisms.
@@ -252,7 +235,6 @@ def plan_poses(
         chosen = choose_poses(
             part,
             poses,
-            index=index,
             repeat=repeat,
             least_gain=least_gain,
             progress=_share(report, 0.4 + 0.6 * number / len(parts), 0.6 / len(parts)),
@@ -262,7 +244,7 @@ def plan_poses(
         around = found.pose[:_AROUND]
         parameters = tuple(part.parameters[i] for i in chosen.kept.tolist())
         plans.append(
-            Plan(leg, parameters, part.scale[chosen.kept], joints, pose, index, chosen, candidates, found.drawn, around)
+            Plan(leg, parameters, part.scale[chosen.kept], joints, pose, chosen, candidates, found.drawn, around)
         )
     return plans
 

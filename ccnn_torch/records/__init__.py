@@ -1,13 +1,12 @@
 """Measured records: files, columns and units in; joints, poses and covariates in SI out; splits into rows."""
 
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES
-from ccnn_torch.records.load import JOINT_LIMIT as JOINT_LIMIT
-from ccnn_torch.records.load import Records as Records
-from ccnn_torch.records.load import check_rows as check_rows
-from ccnn_torch.records.load import load_records as load_records
-from ccnn_torch.records.pose_columns import read_pose as read_pose
-from ccnn_torch.records.pose_columns import stack_columns as stack_columns
+from ccnn_torch.records.headers import read_pose as read_pose, stack_columns as stack_columns
+from ccnn_torch.records.load import (
+    JOINT_LIMIT as JOINT_LIMIT,
+    Records as Records,
+    check_rows as check_rows,
+    load_records as load_records,
+)
 from ccnn_torch.records.read_table import read_table as read_table
-from ccnn_torch.records.table import Table as Table
-from ccnn_torch.records.table import name_lines as name_lines
-from ccnn_torch.records.table import write_table as write_table
+from ccnn_torch.records.table import Table as Table, name_lines as name_lines, write_table as write_table

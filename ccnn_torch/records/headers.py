@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import is_shown, visible
 from ccnn_torch.errors import InputError
+from ccnn_torch.records.table import Table
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import si_unit_of, split_header, to_si
 
@@ -154,3 +161,188 @@ def is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+EULER_ANGLES = {
+    "kuka": (("kuka_a", "kuka_b", "kuka_c"), "ZYX"),
+    "fanuc": (("fanuc_w", "fanuc_p", "fanuc_r"), "xyz"),
+    "staubli": (("staubli_rx", "staubli_ry", "staubli_rz"), "XYZ"),
+}
+"""Angles as controllers give them: columns, and the axes for scipy (capitals: about the moved axes)."""
+
+_ROTATION_VECTOR = ("rx", "ry", "rz")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+# One turn of a pose angle, rounded up so that 360 degrees written as 6.2832 passes.
+_POSE_LIMIT = 6.3
+
+# Letters that are an orientation only together, and how they are most likely meant.
+_TOGETHER = {
+    ("a", "b", "c"): EULER_ANGLES["kuka"][0],
+    ("w", "p", "r"): EULER_ANGLES["fanuc"][0],
+    ("u", "v", "w"): None,
+    ("o", "a", "t"): None,
+    ("alpha", "beta", "gamma"): None,
+    ("phi", "theta", "psi"): None,
+}
+_TURN = re.compile(
+    r"r[xyz]|rot[xyz]|rotvec\w*|roll|pitch|yaw|euler\w*|q[wxyz]|quat\w*|orient\w*|(kuka|fanuc|staubli)\w+"
+)
+_JOINT = re.compile(r"(?:q|j|a|e|joint|axis|axe|achse|theta)0*(\d+)")
+
+
+class HasCoordinates(Protocol):
+    """Attributes of a mechanism that records need."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def joints(self) -> tuple[Coordinate, ...]: ...
+    @property
+    def pose(self) -> tuple[Coordinate, ...]: ...
+    @property
+    def orientations(self) -> tuple[str, ...]: ...
+
+
+def stack_columns(table: Table, coordinates: Sequence[Coordinate], angle_limit: float = np.inf) -> NDArray[np.float64]:
+    """Columns side by side, `rows x len(coordinates)`; refuses angles in rad beyond `angle_limit`."""
+    values = np.empty((len(table), len(coordinates)))
+    for k, coordinate in enumerate(coordinates):
+        values[:, k] = table.column(coordinate.name, coordinate.unit)
+        far = np.flatnonzero(np.abs(values[:, k]) > angle_limit)
+        if table.units[coordinate.name] == "rad" and len(far):
+            raise InputError(
+                f"{table.path}: column '{coordinate.name}[rad]' has {values[far[0], k]:g} at "
+                f"{table.name_rows(far[:1])}, which looks like degrees; write '{coordinate.name}[deg]'"
+            )
+    return values
+
+
+def read_pose(
+    table: Table, mechanism: HasCoordinates
+) -> tuple[NDArray[np.float64], tuple[Coordinate, ...], str | None, tuple[str, ...]]:
+    """Pose `rows x p` [SI], its coordinates, how the orientation was measured, and the columns that were read.
+
+    A rotation vector counts before a quaternion, and that before Euler angles, where a file has several.
+
+    Raises:
+        InputError: a column is missing or cannot be used, or a quaternion has not the norm 1.
+    """
+    if not mechanism.orientations:
+        pose = tuple(mechanism.pose)
+        return stack_columns(table, pose, _POSE_LIMIT), pose, None, tuple(c.name for c in pose)
+    position = tuple(c for c in mechanism.pose if c.name not in _ROTATION_VECTOR)
+    full = (*position, *(Coordinate(name, "rad") for name in _ROTATION_VECTOR))
+    forms = {"rotation_vector": _ROTATION_VECTOR, "quaternion": _QUATERNION}
+    forms |= {name: columns for name, (columns, _) in EULER_ANGLES.items()}
+    form = next((name for name, columns in forms.items() if any(column in table for column in columns)), "none")
+    read = (*(c.name for c in position), *forms.get(form, ()))
+    if form == "rotation_vector":
+        return stack_columns(table, full, _POSE_LIMIT), full, form, read
+    where = stack_columns(table, position)
+    if form == "none":
+        return where, position, form, read
+    # Imported here: few files need it, and the import takes long.
+    from scipy.spatial.transform import Rotation
+
+    if form == "quaternion":
+        turn = Rotation.from_quat(_quaternions(table)[:, [1, 2, 3, 0]])
+    else:
+        columns, axes = EULER_ANGLES[form]
+        angles = stack_columns(table, [Coordinate(name, "rad") for name in columns], _POSE_LIMIT)
+        turn = Rotation.from_euler(axes, angles)
+    return np.concatenate([where, turn.as_rotvec()], axis=1), full, form, read
+
+
+def check_joints(table: Table, joints: Sequence[Coordinate]) -> None:
+    """Refuse a table without a joint's column, with the map of columns that look like joints, or with a joint more.
+
+    Raises:
+        InputError: names the joint, and the map to write.
+    """
+    more = f"q{len(joints) + 1}"
+    if more in table and all(joint.name == f"q{k + 1}" and joint.name in table for k, joint in enumerate(joints)):
+        raise InputError(
+            f"{table.path}: there is a column '{more}', and the machine has {len(joints)} joints: its model lacks one, "
+            f"or is another machine's; where the column is no joint of it write columns: {{{more}: ignore}}"
+        )
+    missing = [joint for joint in joints if joint.name not in table]
+    alike = {number: name for name, number in _numbered(table, joints).items()}
+    if missing and all(k + 1 in alike for k, joint in enumerate(joints) if joint in missing):
+        pairs = {alike[k + 1]: joint for k, joint in enumerate(joints) if joint in missing}
+        usual = {"rad": "deg", "m": "mm"}
+        entries = (
+            f'"{table.header(n)}": "{j.name}[{table.units[n] or usual.get(j.unit, j.unit)}]"' for n, j in pairs.items()
+        )
+        raise InputError(
+            f"{table.path}: there is no column '{missing[0].name}'; these look like joints: {_quoted(pairs)}; write "
+            f"columns: {{{', '.join(entries)}}} if they are meant, or rename them"
+        )
+
+
+def refuse_lost_orientation(table: Table, mechanism: HasCoordinates, unused: Iterable[str]) -> None:
+    """Refuse columns that look like an orientation and would not be used, where none was found.
+
+    Raises:
+        InputError: names the columns, and the map to write.
+    """
+    if not any(coordinate.name in _ROTATION_VECTOR for coordinate in mechanism.pose):
+        return
+    folded = {_folded(name): name for name in unused if _may_be_angle(table.units[name])}
+    together = next((letters for letters in _TOGETHER if all(letter in folded for letter in letters)), ())
+    found = [folded[letter] for letter in together] or [name for key, name in folded.items() if _TURN.fullmatch(key)]
+    if not found:
+        return
+    meant = _TOGETHER.get(together) if together else None
+    if meant is not None:
+        pairs = (f'"{table.header(n)}": "{m}[{table.units[n] or "deg"}]"' for n, m in zip(found, meant, strict=True))
+        say = f"write columns: {{{', '.join(pairs)}}} if they are"
+    else:
+        known = [_ROTATION_VECTOR, _QUATERNION, *(columns for columns, _ in EULER_ANGLES.values())]
+        say = f"map them with columns: to one of {'; '.join(', '.join(names) for names in known)}"
+    ignored = ", ".join(f'"{table.header(name)}": ignore' for name in found)
+    raise InputError(
+        f"{table.path}: columns {', '.join(found)} look like an orientation and would not be used; {say}, or "
+        f"columns: {{{ignored}}} to use positions alone"
+    )
+
+
+def unused_joints(table: Table, joints: Sequence[Coordinate], unused: Iterable[str]) -> list[str]:
+    """Columns that look like joints and are not used."""
+    alike = _numbered(table, joints)
+    return [name for name in unused if name in alike]
+
+
+def _quaternions(table: Table) -> NDArray[np.float64]:
+    quaternion = stack_columns(table, [Coordinate(name, "1") for name in _QUATERNION])
+    norm = np.linalg.norm(quaternion, axis=1)
+    # Written with three digits a unit quaternion is within 0.001 of norm 1; ten times that is no quaternion.
+    wrong = np.flatnonzero(np.abs(norm - 1) > 0.01)
+    if len(wrong):
+        raise InputError(
+            f"{table.path}: the quaternion qw, qx, qy, qz at {table.name_rows(wrong)} has norm "
+            f"{norm[wrong[0]]:.3g} instead of 1; correct it, or give the orientation as rx[rad], ry[rad], rz[rad]"
+        )
+    return quaternion
+
+
+def _numbered(table: Table, joints: Sequence[Coordinate]) -> dict[str, int]:
+    """Columns that look like joints and are none, with their numbers."""
+    known = {joint.name for joint in joints}
+    found = {name: _JOINT.fullmatch(_folded(name)) for name in table.names if name not in known}
+    return {name: int(match[1]) for name, match in found.items() if match is not None}
+
+
+def _quoted(names: Iterable[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
+
+
+def _folded(name: str) -> str:
+    return re.sub(r"[\s_.\-]", "", name).lower()
+
+
+def _may_be_angle(unit: str) -> bool:
+    """Whether a column in this unit may be a part of an orientation: not where it is a length, a temperature …"""
+    try:
+        return not unit or si_unit_of(unit) in ("rad", "1")
+    except InputError:
+        return True

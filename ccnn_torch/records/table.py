@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.csv_text import csv_cell
-from ccnn_torch.files.write import writing_whole
+from ccnn_torch.files.write import csv_cell, writing_whole
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import LARGEST, parse_header, split_header, to_si, write_hint
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from ccnn_torch.files.csv_text import csv_text
-from ccnn_torch.files.write import write_whole
+from ccnn_torch.files.write import csv_text, write_whole
 
 
 def write_rows(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> None:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ccnn_torch.config.keys import list_keys
-from ccnn_torch.config.tree import Section, config_from_options
+from ccnn_torch.config.tree import JobConfig
 from ccnn_torch.effects.covariates import SHIFT
 
 Positive = Annotated[float, Field(gt=0)]
 
 
-class SimulateConfig(Section):
+class SimulateConfig(JobConfig):
     """What `ccnn simulate` accepts."""
 
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
@@ -43,17 +40,3 @@ class SimulateConfig(Section):
     rotation_weight: float = Field(
         default=0.04, gt=0, description="weight of orientation against position in that number, in m per rad"
     )
-
-
-def load_simulate_config(path: Path | None, overrides: Iterable[str] = ()) -> SimulateConfig:
-    """Read a config file (defaults where there is none) and put overrides ``key=value`` over it.
-
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    return config_from_options(SimulateConfig, path, overrides)
-
-
-def describe_simulate_keys() -> list[tuple[str, str, str]]:
-    """Every key with its default and what it means."""
-    return list(list_keys(SimulateConfig))

@@ -2,24 +2,141 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.noise import Noise, noise_of_pose
-from ccnn_torch.effects import Acting, Situation, default_gravity, measured_pose, reached
-from ccnn_torch.effects.covariates import directions
+from ccnn_torch.config.sizes import Noise, noise_of_pose
+from ccnn_torch.effects import OUTLIER, Acting, Situation, default_gravity, measured_pose, reached
+from ccnn_torch.effects.covariates import covariate_units, directions, draw_covariates
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.files.write import make_folder
+from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
-from ccnn_torch.simulation.acting import Injected, act, read_wanted, units_of
+from ccnn_torch.records import name_lines, write_table
+from ccnn_torch.report.table import Table
+from ccnn_torch.simulation.acting import Injected, Wanted, act, read_wanted, refuse_beyond_bounds, units_of
 from ccnn_torch.simulation.config import SimulateConfig
-from ccnn_torch.simulation.limits import refuse_beyond_bounds
-from ccnn_torch.simulation.outliers import bad_rows
-from ccnn_torch.simulation.rows import draw_moves, draw_poses
+
+# Between two moves; rows so far apart are not taken for one trajectory [s].
+_PAUSE = 2.0
+# For velocities, as a share of a move.
+_INSTANT = 1e-4
+_DRAWS = 50
+
+Rows = tuple[Tensor, dict[str, Tensor]]
+
+
+def draw_poses(mechanism: Mechanism, rows: int, config: SimulateConfig, generator: torch.Generator) -> Rows:
+    """Poses at rest, away from singularities: joints `s x n` [SI], and the columns beside them, `s` each.
+
+    Raises:
+        InputError: nearly all of the workspace is too close to a singularity.
+    """
+
+    def draw(count: int) -> tuple[Tensor]:
+        joints = mechanism.sample_joints(count, generator)
+        return (joints[_regular(mechanism, joints, config)],)
+
+    (joints,) = _collect(mechanism, rows, config, draw)
+    load = {"m": config.load, "rad": config.moment}
+    return joints, draw_covariates(mechanism, joints, generator, config.duration, load)
+
+
+def draw_moves(mechanism: Mechanism, rows: int, config: SimulateConfig, generator: torch.Generator) -> Rows:
+    """Rows along moves from one drawn configuration towards another, with a pause after each.
+
+    An arm moves on straight lines in its joints, other machines in their pose, with the least jerk (Flash and Hogan
+    1985: 10 u³ - 15 u⁴ + 6 u⁵). The columns have the joints' velocities as well, and their signs as directions.
+
+    Raises:
+        InputError: nearly all moves come too close to a singularity.
+    """
+    each = max(round(config.move / config.step), 2)
+    # Middle of each interval: at the ends of a move nothing moves.
+    at = (torch.arange(each, dtype=torch.float64) + 0.5) / each
+    places = torch.stack([at - _INSTANT, at, at + _INSTANT])
+    share = (10 * places**3 - 15 * places**4 + 6 * places**5)[:, None, :, None]
+
+    def draw(count: int) -> tuple[Tensor, Tensor]:
+        moves = -(-count // each)
+        arm = isinstance(mechanism, SerialArm)
+        sample = mechanism.sample_joints if arm else mechanism.sample_workspace
+        start, end = sample(2 * moves, generator).reshape(2, moves, 1, -1)
+        path = start + config.way * (end - start) * share
+        joints = path if arm else mechanism.solve_inverse(path)
+        speed = (joints[2] - joints[0]) / (2 * _INSTANT * config.move)
+        whole = _regular(mechanism, joints[1], config).all(-1) & torch.isfinite(joints).all(-1).all(-1).all(0)
+        return joints[1][whole].flatten(0, 1), speed[whole].flatten(0, 1)
+
+    joints, speed = _collect(mechanism, rows, config, draw)
+    number = torch.arange(rows)
+    time = number * config.step + (number // each) * _PAUSE
+    load = {"m": config.load, "rad": config.moment}
+    columns = draw_covariates(mechanism, joints, generator, 1.0, load) | {"time": time.double()}
+    for i in range(joints.shape[-1]):
+        columns[f"direction{i + 1}"] = torch.where(speed[:, i] < 0, -1.0, 1.0).double()
+        columns[f"speed{i + 1}"] = speed[:, i]
+    return joints, columns
+
+
+def _regular(mechanism: Mechanism, joints: Tensor, config: SimulateConfig) -> Tensor:
+    condition = mechanism.condition_number(joints, config.rotation_weight)
+    return torch.isfinite(joints).all(-1) & (condition <= config.max_condition)
+
+
+def _collect(
+    mechanism: Mechanism, rows: int, config: SimulateConfig, draw: Callable[[int], tuple[Tensor, ...]]
+) -> tuple[Tensor, ...]:
+    found = draw(rows)
+    for _ in range(_DRAWS):
+        if len(found[0]) >= rows:
+            return tuple(part[:rows] for part in found)
+        found = tuple(torch.cat(parts) for parts in zip(found, draw(rows), strict=True))
+    raise InputError(
+        f"mechanism '{mechanism.name}': hardly any configuration has a condition number under "
+        f"{config.max_condition:g}; make max_condition larger"
+    )
+
+
+_KEYS = {"share": (0.03, "share of the rows"), "size": (1e-3, "standard deviation, in m and rad")}
+
+
+def bad_rows(
+    wanted: Wanted, rows: int, channels: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor, dict[str, tuple[float, str]]]:
+    """Gross errors of a share of the rows.
+
+    Returns:
+        Numbers of the rows, ascending; the displacements of their frames, `rows x c` [m, rad]; and the parameters.
+
+    Raises:
+        InputError: a parameter that does not exist or is out of range.
+    """
+    values = {}
+    for name, text in wanted.values.items():
+        try:
+            values[name] = float(text)
+        except ValueError:
+            raise InputError(f"--effect outlier: {name}={text} is no number") from None
+    wrong = sorted(set(values) - set(_KEYS))
+    if wrong:
+        known = ", ".join(f"{key} ({meaning})" for key, (_, meaning) in _KEYS.items())
+        raise InputError(f"--effect outlier: it has no parameter '{wrong[0]}'; it has {known}")
+    share, size = (values.get(key, default) for key, (default, _) in _KEYS.items())
+    if not (0 < share <= 0.5 and size > 0):
+        raise InputError("--effect outlier: share must be above 0 and at most 0.5, size above 0")
+    count = max(round(share * rows), 1)
+    chosen = torch.randperm(rows, generator=generator)[:count].sort().values
+    added = torch.zeros(rows, channels, dtype=torch.float64)
+    added[chosen] = size * torch.randn(count, channels, generator=generator, dtype=torch.float64)
+    return chosen, added, {"share": (share, "1"), "size": (size, "m, rad")}
+
 
 # Rounds in which rows without a pose are drawn anew.
 _TRIES = 50
@@ -161,3 +278,43 @@ def _kept(columns: dict[str, Tensor], wanted: list[str] | None) -> dict[str, Ten
 def _noise(given: Noise, machine: Mechanism) -> Tensor:
     by_name = noise_of_pose(given, machine.pose)
     return torch.tensor([by_name.get(c.name, 0.0) for c in machine.pose], dtype=torch.float64)
+
+
+def write_simulated(path: Path, simulated: Simulated) -> None:
+    """Write the records: joints, pose, covariates, in SI.
+
+    Raises:
+        InputError: the name does not end in .csv, or the file cannot be written.
+    """
+    if path.suffix.lower() != ".csv":
+        raise InputError(f"--out: '{path}' must end in .csv")
+    machine, units = simulated.mechanism, covariate_units(simulated.mechanism)
+    columns = {c.header: simulated.joints[:, i].numpy() for i, c in enumerate(machine.joints)}
+    columns |= {c.header: simulated.pose[:, i].numpy() for i, c in enumerate(machine.pose)}
+    columns |= {f"{name}[{units[name]}]": values.numpy() for name, values in simulated.covariates.items()}
+    make_folder(path.parent)
+    write_table(path, columns)
+
+
+def injected_table(simulated: Simulated) -> Table:
+    """What was injected, a row for each parameter."""
+    rows = [
+        (one.name, name, f"{value:.4g}", unit)
+        for one in simulated.injected
+        for name, (value, unit) in one.parameters.items()
+    ]
+    parts = []
+    effects = [one for one in simulated.injected if one.name != OUTLIER]
+    if effects:
+        alone = "; ".join(f"{one.name} alone {one.gap * 1e6:.3g} µm" for one in effects)
+        without = "noise and bad rows" if simulated.outliers else "noise"
+        parts.append(
+            f"RMS error of the position {simulated.gap * 1e6:.3g} µm over all rows without {without} ({alone})"
+        )
+    if simulated.outliers:
+        # As the file will have them, below a header.
+        lines = np.arange(len(simulated.joints), dtype=np.int64) + 2
+        added = sum(one.gap**2 for one in simulated.injected if one.name == OUTLIER) ** 0.5
+        named = name_lines(lines, simulated.outliers, len(simulated.outliers))
+        parts.append(f"RMS error by bad rows {added * 1e6:.3g} µm over all rows; bad rows: {named}")
+    return Table("Injected", ("effect", "parameter", "value", "unit"), tuple(rows), "; ".join(parts))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -36,6 +36,7 @@ class _Choice(NamedTuple):
     residuals: Tensor
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     """A learner as a scikit-learn regressor; a subclass names the learner and has its settings as parameters.
 
@@ -44,14 +45,11 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     training row is ever held out for validation.
     """
 
-    network_: nn.Module
-    scaling_: Scaling
-
     _learner: ClassVar[Callable[[Any], Learner]]
     _settings: ClassVar[type[Any]]
 
-    random_state: Any
-    periodic: Sequence[int | str] | None
+    periodic: Sequence[int | str] | None = None
+    random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> LearnerRegressor:
         """Train on all rows.
@@ -71,8 +69,8 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         seed = int(generator.randint(np.iinfo(np.int32).max))
         choice = self._choose(inputs, targets, weights, seed, generator)
         learner, scaling, training = self._train(inputs, targets, weights, seed, stop_at=choice and choice.steps)
-        self.network_ = learner.network(0).requires_grad_(False)
-        self.scaling_ = scaling.repeat(0)
+        self.network_: nn.Module = learner.network(0).requires_grad_(False)
+        self.scaling_: Scaling = scaling.repeat(0)
         self.n_iter_ = int(training.best_step[0])
         self.loss_curve_ = training.history["error_train"][: self.n_iter_, 0].tolist()
         converged = getattr(learner, "converged", None)
@@ -203,12 +201,13 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         return (outputs.squeeze(-1) if self._flat else outputs).numpy()
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class SteppedRegressor(LearnerRegressor):
     """One whose learner improves step by step, so that rows held out can say when it is best."""
 
-    early_stopping: bool
-    validation_fraction: float
-    n_iter_no_change: int | None
+    early_stopping: bool = False
+    validation_fraction: float = 0.2
+    n_iter_no_change: int | None = None
 
     def _choose(
         self, inputs: _Floats, targets: _Floats, weights: _Floats, seed: int, generator: np.random.RandomState

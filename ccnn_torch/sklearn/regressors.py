@@ -7,16 +7,17 @@ estimator with its defaults fits a few hundred rows in well under a second.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
-from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.ccnn import CCNN
-from ccnn_torch.learners.enn import ENN, ENNSettings
+from ccnn_torch.learners.enn import ENN
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.sklearn.base import LearnerRegressor, SteppedRegressor
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class CCNNRegressor(SteppedRegressor):
     """Cooperative coevolution of a masked network's layers, refined by Levenberg-Marquardt (paper 000, section III).
 
@@ -60,52 +61,24 @@ class CCNNRegressor(SteppedRegressor):
     _learner = CCNN
     _settings = CCNNSettings
 
-    def __init__(
-        self,
-        *,
-        hidden: int | Sequence[int] = (12, 12),
-        rival_hidden: Sequence[int] = (),
-        population: int = 40,
-        generations: int = 10,
-        members: int = 2,
-        refine_every: int = 0,
-        refinement_iterations: int = 20,
-        waves: int = CCNNSettings.waves,
-        wave_searches: int = CCNNSettings.wave_searches,
-        crossover: float = CCNNSettings.crossover,
-        structural_mutation: float = CCNNSettings.structural_mutation,
-        weight_mutation: float = CCNNSettings.weight_mutation,
-        density: float = CCNNSettings.density,
-        weight_range: float = CCNNSettings.weight_range,
-        bias: bool = CCNNSettings.bias,
-        periodic: Sequence[int | str] | None = None,
-        early_stopping: bool = False,
-        validation_fraction: float = 0.2,
-        n_iter_no_change: int | None = None,
-        random_state: Any = 0,
-    ) -> None:
-        self.hidden = hidden
-        self.rival_hidden = rival_hidden
-        self.population = population
-        self.generations = generations
-        self.members = members
-        self.refine_every = refine_every
-        self.refinement_iterations = refinement_iterations
-        self.waves = waves
-        self.wave_searches = wave_searches
-        self.crossover = crossover
-        self.structural_mutation = structural_mutation
-        self.weight_mutation = weight_mutation
-        self.density = density
-        self.weight_range = weight_range
-        self.bias = bias
-        self.periodic = periodic
-        self.early_stopping = early_stopping
-        self.validation_fraction = validation_fraction
-        self.n_iter_no_change = n_iter_no_change
-        self.random_state = random_state
+    hidden: int | Sequence[int] = (12, 12)
+    rival_hidden: Sequence[int] = ()
+    population: int = 40
+    generations: int = 10
+    members: int = 2
+    refine_every: int = 0
+    refinement_iterations: int = 20
+    waves: int = CCNNSettings.waves
+    wave_searches: int = CCNNSettings.wave_searches
+    crossover: float = CCNNSettings.crossover
+    structural_mutation: float = CCNNSettings.structural_mutation
+    weight_mutation: float = CCNNSettings.weight_mutation
+    density: float = CCNNSettings.density
+    weight_range: float = CCNNSettings.weight_range
+    bias: bool = CCNNSettings.bias
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class BPLMRegressor(SteppedRegressor):
     """Fully connected sigmoid networks from many starts, trained by Levenberg-Marquardt with Bayesian regularisation.
 
@@ -140,32 +113,14 @@ class BPLMRegressor(SteppedRegressor):
     _learner = BPLM
     _settings = BPLMSettings
 
-    def __init__(
-        self,
-        *,
-        hidden: int | Sequence[int] = (10,),
-        restarts: int = 3,
-        iterations: int = BPLMSettings.iterations,
-        tolerance: float = BPLMSettings.tolerance,
-        patience: int = BPLMSettings.patience,
-        periodic: Sequence[int | str] | None = None,
-        early_stopping: bool = False,
-        validation_fraction: float = 0.2,
-        n_iter_no_change: int | None = None,
-        random_state: Any = 0,
-    ) -> None:
-        self.hidden = hidden
-        self.restarts = restarts
-        self.iterations = iterations
-        self.tolerance = tolerance
-        self.patience = patience
-        self.periodic = periodic
-        self.early_stopping = early_stopping
-        self.validation_fraction = validation_fraction
-        self.n_iter_no_change = n_iter_no_change
-        self.random_state = random_state
+    hidden: int | Sequence[int] = (10,)
+    restarts: int = 3
+    iterations: int = BPLMSettings.iterations
+    tolerance: float = BPLMSettings.tolerance
+    patience: int = BPLMSettings.patience
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class ENNRegressor(SteppedRegressor):
     """One evolved population of whole networks, without cooperation and without refinement: the paper's comparison.
 
@@ -201,40 +156,18 @@ class ENNRegressor(SteppedRegressor):
     _learner = ENN
     _settings = ENNSettings
 
-    def __init__(
-        self,
-        *,
-        hidden: int | Sequence[int] = (8,),
-        population: int = 50,
-        generations: int = 70,
-        crossover: float = ENNSettings.crossover,
-        structural_mutation: float = ENNSettings.structural_mutation,
-        weight_mutation: float = ENNSettings.weight_mutation,
-        density: float = ENNSettings.density,
-        weight_range: float = ENNSettings.weight_range,
-        bias: bool = ENNSettings.bias,
-        periodic: Sequence[int | str] | None = None,
-        early_stopping: bool = False,
-        validation_fraction: float = 0.2,
-        n_iter_no_change: int | None = None,
-        random_state: Any = 0,
-    ) -> None:
-        self.hidden = hidden
-        self.population = population
-        self.generations = generations
-        self.crossover = crossover
-        self.structural_mutation = structural_mutation
-        self.weight_mutation = weight_mutation
-        self.density = density
-        self.weight_range = weight_range
-        self.bias = bias
-        self.periodic = periodic
-        self.early_stopping = early_stopping
-        self.validation_fraction = validation_fraction
-        self.n_iter_no_change = n_iter_no_change
-        self.random_state = random_state
+    hidden: int | Sequence[int] = (8,)
+    population: int = 50
+    generations: int = 70
+    crossover: float = ENNSettings.crossover
+    structural_mutation: float = ENNSettings.structural_mutation
+    weight_mutation: float = ENNSettings.weight_mutation
+    density: float = ENNSettings.density
+    weight_range: float = ENNSettings.weight_range
+    bias: bool = ENNSettings.bias
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class GRNNRegressor(LearnerRegressor):
     """Kernel regression (Specht's general regression neural network), one bandwidth per input found by leave-one-out.
 
@@ -262,23 +195,9 @@ class GRNNRegressor(LearnerRegressor):
     _learner = GRNN
     _settings = GRNNSettings
 
-    def __init__(
-        self,
-        *,
-        iterations: int = GRNNSettings.iterations,
-        candidates: int = GRNNSettings.candidates,
-        narrowest: float = GRNNSettings.narrowest,
-        widest: float = GRNNSettings.widest,
-        queries: int = GRNNSettings.queries,
-        references: int = GRNNSettings.references,
-        periodic: Sequence[int | str] | None = None,
-        random_state: Any = 0,
-    ) -> None:
-        self.iterations = iterations
-        self.candidates = candidates
-        self.narrowest = narrowest
-        self.widest = widest
-        self.queries = queries
-        self.references = references
-        self.periodic = periodic
-        self.random_state = random_state
+    iterations: int = GRNNSettings.iterations
+    candidates: int = GRNNSettings.candidates
+    narrowest: float = GRNNSettings.narrowest
+    widest: float = GRNNSettings.widest
+    queries: int = GRNNSettings.queries
+    references: int = GRNNSettings.references

@@ -8,8 +8,7 @@ from typing import Any
 
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.csv_text import csv_text
-from ccnn_torch.files.write import write_whole
+from ccnn_torch.files.write import csv_text, write_whole
 from ccnn_torch.report.results.base import Spread, interval_text
 from ccnn_torch.report.results.run import Method, RunResults
 from ccnn_torch.report.table import Table, markdown_table

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import TypeVar
 
 from ccnn_torch.calibration.calibrate import makers
-from ccnn_torch.calibration.config import RunConfig, load_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import finish_runs
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.report.results.run import RunResults
-from ccnn_torch.run_folder.folder import RunFolder, kept_for
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import RunFolder, kept_for, locked
 
 _Written = TypeVar("_Written")
 
@@ -74,7 +73,7 @@ def _check_folder(config: RunConfig) -> None:
     folder = RunFolder(Path(str(config.out)))
     if not folder.config.is_file():
         return
-    there, wanted = (c.model_dump(mode="json", exclude={"out"}) for c in (load_config(folder.config), config))
+    there, wanted = (c.model_dump(mode="json", exclude={"out"}) for c in (RunConfig.from_file(folder.config), config))
     other = sorted(key for key in wanted if there[key] != wanted[key])
     if other:
         raise InputError(

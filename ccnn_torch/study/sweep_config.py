@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from ccnn_torch.calibration.config import RunConfig, load_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.engine import check_engine
 from ccnn_torch.errors import InputError
 from ccnn_torch.study.runs import Study
@@ -62,7 +62,7 @@ def load_sweep(path: str | Path | None, changes: Iterable[str], out: str | Path)
         words = [f"{key}={value}" for key, value in zip(varied, combination, strict=True)]
         name = _name(words)
         try:
-            config = load_config(path, [*every, *words, f"out={Path(out) / name}", f"name={name}"])
+            config = RunConfig.from_file(path, [*every, *words, f"out={Path(out) / name}", f"name={name}"])
         except InputError as problem:
             raise InputError(f"job {' '.join(words)}: {problem}") from None
         if name in jobs:

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
-from ccnn_torch.mechanisms.assembly_mode import jump_sentence
-from ccnn_torch.mechanisms.protocol import wrong_names
+from ccnn_torch.mechanisms.registry import jump_sentence, wrong_names
 from ccnn_torch.numerics.rotations import vee
 
 _BATCHES: tuple[tuple[int, ...], ...] = ((), (2,), (2, 3))

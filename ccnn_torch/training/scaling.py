@@ -77,11 +77,6 @@ class Scaling(nn.Module):
         )
 
     @property
-    def feature_count(self) -> int:
-        """Number of features that a learner sees."""
-        return len(self.linear) + 2 * len(self.periodic) + self.angle_count
-
-    @property
     def angle_count(self) -> int:
         """Number of features, the last ones, that are scaled angles."""
         return self.centre.shape[-1] - len(self.linear)
@@ -107,7 +102,7 @@ class Scaling(nn.Module):
         return Scaling(*about, self.mean.clone(), self.deviation.clone())
 
     def features(self, inputs: Tensor) -> Tensor:
-        """inputs: `[r x] ... x i` [SI]; returns `[r x] ... x feature_count` [1]."""
+        """inputs: `[r x] ... x i` [SI]; returns `[r x] ... x f` [1]."""
         # Without a periodic input nothing is picked: exported graphs stay free of gather.
         if len(self.periodic) == 0:
             return self._scaled(inputs, slice(None))

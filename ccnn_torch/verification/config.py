@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
-from ccnn_torch.config.tree import Columns, Files, JointMap, Section, config_from_options
+from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap
 
 
-class VerifyConfig(Section):
+class VerifyConfig(JobConfig):
     """Keys of `ccnn verify`, which mean the same in a config for `ccnn run`."""
 
     of_a_run = ("records", "columns", "joint_map", "mechanism", "mechanism_keys")
@@ -23,14 +21,3 @@ class VerifyConfig(Section):
         default=None, description="the nominal machine; the same as --mechanism; null = the model's"
     )
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
-
-
-def load_verify_config(
-    path: Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
-) -> VerifyConfig:
-    """Read a config file (defaults where there is none) and put overrides ``key=value`` over it.
-
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    return config_from_options(VerifyConfig, path, overrides, note)

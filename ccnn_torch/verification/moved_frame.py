@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.mechanisms.frames.closed_form_start import rigid_body_frame
+from ccnn_torch.mechanisms.frames.fit import rigid_body_frame
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 # Weight of orientation against position [m/rad], as in fits of an arm's frames.

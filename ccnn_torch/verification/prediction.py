@@ -19,8 +19,8 @@ from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records
 from ccnn_torch.records.headers import columns_there
 from ccnn_torch.records.joint_map import read_joint_map
+from ccnn_torch.records.load import read_source
 from ccnn_torch.records.read_table import mapped
-from ccnn_torch.records.sources import read_source
 from ccnn_torch.verification.moved_frame import Motion
 
 # As in a run, if no card gives it: weight of orientation [m/rad], and damping of an arm's joint deviation.

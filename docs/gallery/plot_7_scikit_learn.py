@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 from sklearn.dummy import DummyRegressor
 from sklearn.model_selection import KFold, cross_val_score
 
-from ccnn_torch.simulation.cases import build_case
+from ccnn_torch.simulation.case_study import build_case
 from ccnn_torch.sklearn import BPLMRegressor, GRNNRegressor
 
 case = build_case("tripod")

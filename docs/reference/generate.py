@@ -12,7 +12,7 @@ from typing import Any
 import typer
 
 from ccnn_torch.cli.application import app
-from ccnn_torch.config.commands import keys_by_section
+from ccnn_torch.config.keys import keys_by_section
 
 __all__ = ["write_reference"]
 

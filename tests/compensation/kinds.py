@@ -15,8 +15,8 @@ from ccnn_torch.compensation import (
     Care,
     Compensator,
     build_machine,
+    expand,
     expand_effects,
-    expand_geometry,
     fit_compensator,
     geometric_deviation,
 )
@@ -119,7 +119,7 @@ def expanded() -> Compensator:
     made = overconstrained()
     mechanism, joints = made.mechanism, made.joints
     exact = geometric_deviation(mechanism, mechanism.nominal, made.identified)
-    geometry = expand_geometry(exact, joints)
+    geometry = expand(exact, joints)
     situation = made.situation(joints, made.inputs[:, 2:])
     effects = expand_effects(situation, made.acting, [], 0.1, Care(0.3, 1e-2, 3.0, 6.0))
     network, scaling, deviations = small_network(joints, 2e-5)

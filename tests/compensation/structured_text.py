@@ -37,6 +37,8 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
     "LN": np.log,
     "SIN": np.sin,
     "COS": np.cos,
+    "LREAL_TO_INT": np.rint,
+    "REAL_TO_INT": np.rint,
 }
 _TYPES = {"LREAL": np.float64, "REAL": np.float32, "INT": np.int64, "DINT": np.int64, "BOOL": np.bool_}
 

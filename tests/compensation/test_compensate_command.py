@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +14,7 @@ import typer
 from stand_ins import fields, tripod_joints
 from typer.testing import CliRunner
 
-from ccnn_torch.cli.compensate import compensate
+from ccnn_torch.cli.with_model import compensate
 from ccnn_torch.compensation import Compensator, fit_compensator, load_model, save_model
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
@@ -250,3 +253,15 @@ def test_a_cell_that_is_no_number(folder: Path, tmp_path: Path) -> None:
 def test_pose_and_back_exclude_each_other(folder: Path, ideal: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="exclude each other"):
         compensate(folder / "model.onnx", ideal, tmp_path / "out.csv", pose=True, back=True)
+
+
+def test_it_loads_what_it_needs() -> None:
+    """Neither the diagnosis nor the learners that are evolved; and the packages' doors give each of their names."""
+    code = "import sys, ccnn_torch.compensation.job; print(*(m for m in sys.modules if m.startswith('ccnn_torch.')))"
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert len(loaded) < 120 and not {m.split(".")[1] for m in loaded} & {"diagnosis", "motion", "evolution", "report"}
+    for package in ("", ".compensation", ".effects", ".learners", ".mechanisms", ".motion"):
+        names = import_module(f"ccnn_torch{package}")
+        assert names.__all__ and all(getattr(names, name) is not None for name in names.__all__)
+    with pytest.raises(ImportError, match="cannot import name 'Tripd'"):
+        exec("from ccnn_torch.mechanisms import Tripd")

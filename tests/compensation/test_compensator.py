@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.optimize import root
 from stand_ins import Sigmoids, arm_compensator, tripod_compensator, tripod_joints
 from torch import Tensor

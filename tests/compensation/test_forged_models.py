@@ -14,8 +14,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from machines import compensated, known
 from onnx import TensorProto, helper, numpy_helper
 from safetensors import safe_open

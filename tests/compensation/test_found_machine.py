@@ -13,7 +13,7 @@ from fitted import LIMITS, six_axis_arm
 
 from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.calibration.calibrate import calibrate
-from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.compensation import IdentifiedGeometry, load_compensation
 from ccnn_torch.compensation.wanted_poses import WantedPoses
 from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
@@ -21,8 +21,7 @@ from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import FiveBar
 from ccnn_torch.records import read_table, write_table
-from ccnn_torch.simulation.job import simulate_records
-from ccnn_torch.simulation.outputs import write_simulated
+from ccnn_torch.simulation.job import simulate_records, write_simulated
 
 Block = dict[str, Any]
 
@@ -70,7 +69,7 @@ def test_it_is_a_mechanism(found: Path) -> None:
 
 def test_so_is_that_of_a_model_file(found: Path, tmp_path: Path) -> None:
     keys = {"records": str(found.with_name("rows.csv")), "mechanism": "five_bar", "geometry": "identify"}
-    made = calibrate(make_config(**keys, effects="none", methods=["constant"]))
+    made = calibrate(RunConfig.from_keys(**keys, effects="none", methods=["constant"]))
     made.save(tmp_path, forms=("onnx",))
     machine = made.compensator().machine
     assert machine is not None

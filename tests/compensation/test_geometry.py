@@ -11,14 +11,14 @@ from machines import arm, overconstrained, small_network
 from torch import Tensor
 
 from ccnn_torch.compensation import (
-    expand_geometry,
+    expand,
     fit_compensator,
     geometric_deviation,
     load_model,
     save_model,
 )
 from ccnn_torch.compensation.export.to_onnx import to_onnx
-from ccnn_torch.compensation.geometry.expanded import ExpandedGeometry
+from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
 from ccnn_torch.compensation.model_files.onnx_session import check_graph, open_onnx
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.mechanisms import Mechanism
@@ -51,7 +51,7 @@ def fields_of(mechanism: Mechanism) -> dict[str, object]:
 
 def test_the_deviation_runs_in_onnx_in_double() -> None:
     joints = arm().joints
-    module = expand_geometry(lambda q: 1e-3 * q * q.roll(1, -1), joints)
+    module = expand(lambda q: 1e-3 * q * q.roll(1, -1), joints)
     model = to_onnx(module, {"joints": joints}, ["deviation"], 20)
     check_graph(model)
     session = open_onnx(model.SerializeToString())
@@ -63,8 +63,8 @@ def test_a_machine_without_closed_forms_is_expanded(tmp_path: Path) -> None:
     known = overconstrained()
     machine, joints = known.mechanism, known.joints
     exact = geometric_deviation(machine, machine.nominal, known.identified)
-    module = expand_geometry(exact, joints)
-    assert isinstance(module, ExpandedGeometry)
+    module = expand(exact, joints)
+    assert isinstance(module, ChebyshevExpansion)
     fresh = joints.mean(0) + 0.9 * (joints - joints.mean(0)).roll(1, 0)
     wanted = exact(fresh)
     assert float((module(fresh) - wanted).abs().max()) < 1e-2 * float(wanted.abs().max())
@@ -89,10 +89,10 @@ def test_a_machine_without_closed_forms_is_expanded(tmp_path: Path) -> None:
 def test_an_expansion_says_when_it_does_not_fit() -> None:
     joints = torch.rand(100, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     with pytest.raises(MethodFailedError, match="no polynomial"):
-        expand_geometry(lambda q: 1e-3 * torch.sign(q - 0.5), joints)
+        expand(lambda q: 1e-3 * torch.sign(q - 0.5), joints)
     with pytest.raises(InputError, match="joints"):
-        expand_geometry(lambda q: q, torch.rand(30, 12, dtype=torch.float64))
-    nothing = expand_geometry(torch.zeros_like, joints)
+        expand(lambda q: q, torch.rand(30, 12, dtype=torch.float64))
+    nothing = expand(torch.zeros_like, joints)
     assert bool((nothing(joints) == 0).all())
 
 
@@ -102,6 +102,6 @@ def test_a_polynomial_is_expanded_exactly() -> None:
     def cubic(q: Tensor) -> Tensor:
         return torch.stack([q[:, 0] ** 3, q[:, 0] * q[:, 1] * q[:, 2], 1 + q[:, 2] ** 2], -1)
 
-    module = expand_geometry(cubic, joints)
+    module = expand(cubic, joints)
     assert module.degree == 4
     torch.testing.assert_close(module(joints), cubic(joints), rtol=0, atol=1e-7)

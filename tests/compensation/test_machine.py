@@ -29,7 +29,7 @@ from stand_ins import fields
 from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, Solution, load_model, save_model
-from ccnn_torch.compensation.export.export import probe_points
+from ccnn_torch.compensation.agreement import probe_points
 from ccnn_torch.compensation.machine.alone import all_over, machine_alone
 from ccnn_torch.compensation.machine.inverse import InverseMachine
 from ccnn_torch.compensation.machine.machine import SETTLED, Machine, limits_of

@@ -19,8 +19,7 @@ import onnxruntime
 import pytest
 import torch
 from frozen import frozen
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from stand_ins import Sigmoids, fields, tripod_compensator
@@ -33,7 +32,8 @@ from ccnn_torch.compensation import (
     load_model,
     save_model,
 )
-from ccnn_torch.compensation.export.export import probe_points, verify
+from ccnn_torch.compensation.agreement import probe_points
+from ccnn_torch.compensation.export.export import verify
 from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
@@ -337,6 +337,10 @@ def test_cards(copied: Path) -> None:
     (copied / "ccnn.card.json").write_text(json.dumps(card | {"limits": {}}))
     with pytest.raises(ModelFileError, match="its card says something else about 'limits'"):
         load_model(path)
+    for key, value in (("columns", " "), ("columns", {"A1": 1}), ("joint_map", [["q1", "J1"]])):
+        (copied / "ccnn.card.json").write_text(json.dumps(card | {key: value}))
+        with pytest.raises(ModelFileError, match=f"{key} is no table of names and texts"):
+            load_model(path)
     (copied / "ccnn.card.json").write_text("{")
     with pytest.raises(ModelFileError, match="this card is damaged"):
         load_model(path)

@@ -96,7 +96,7 @@ def test_the_code_has_no_heap_no_recursion_and_no_state(tmp_path: Path) -> None:
     source = (tmp_path / "compensator.c").read_text()
     assert not re.search(r"\b(malloc|calloc|free|goto|while|printf)\b", source)
     outside = [line for line in source.splitlines() if line.startswith("static") and "(" not in line]
-    assert outside and all(line.startswith("static const ccnn_real") for line in outside)
+    assert all(line.startswith("static const ccnn_real") for line in outside)
     for function in re.findall(r"^static void (\w+)\(", source, re.MULTILINE):
         body = source.split(f"static void {function}(")[1].split("\n}\n")[0]
         assert not re.search(r"ccnn_(?!min|max|real)\w*\(", body.partition("{")[2])
@@ -109,7 +109,7 @@ def test_connections_that_are_dead_cost_nothing() -> None:
         compensator = masked(density)
         layers: list[Any] = list(compensator.network.layers)  # type: ignore[arg-type, union-attr]
         alive = sum(int((layer.weight != 0).sum()) for layer in layers)
-        return alive, form_of(compensator).deviation.operations()["mul"]
+        return alive, form_of(compensator).programs["step"].operations()["mul"]
 
     (few, cheap), (many, dear) = count(0.3), count(1.0)
     assert many == 3 * 6 + 6 * 6 + 6 * 3
@@ -117,7 +117,7 @@ def test_connections_that_are_dead_cost_nothing() -> None:
 
 
 def test_harmonics_cost_one_sine_and_cosine_a_joint() -> None:
-    few, many = (form_of(six_joints(count, links=False)).deviation.operations() for count in (2, 12))
+    few, many = (form_of(six_joints(count, links=False)).programs["step"].operations() for count in (2, 12))
     assert few["sin"] == many["sin"] and few["cos"] == many["cos"]
 
 
@@ -171,7 +171,7 @@ def test_structured_text_is_parsed_and_gives_the_numbers(kind: str, monkeypatch:
         ideal(command=golden.joints.T, **more)
         found = {name: compensate.values[name].T for name in ("command", "deviation", "status")}
         found |= {"ideal": ideal.values["joints"].T, "ideal_status": ideal.values["status"]}
-        if form.spread is not None:
+        if form.sd:
             spread = Instance(blocks, "CCNN_DeviationSd", rows)
             spread(command=golden.joints.T, **more)
             found["sd"] = spread.values["sd"].T

@@ -40,7 +40,7 @@ def _by_least_squares(said: Diagnosis, nominal: torch.Tensor) -> list[tuple[floa
     keep, white = analysis.whitening.keep(), analysis.whitening
     frames = frame_columns(situation, white.weight > 0)
     number = cut(situation.joints[keep], frames[keep]).numpy()
-    atoms = [analysis.dictionary.atoms[i] for i in said.judgement.found.members]
+    atoms = [analysis.atoms[i] for i in said.judgement.found.members]
     effects = torch.cat([a.columns for a in atoms if a.name in said.verdict["effects"]], -1)
     channels = white.channels[white.channels < 3]
     scale = (white.weight[keep].sqrt()[:, None] / white.sigma).numpy()

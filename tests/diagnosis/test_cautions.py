@@ -213,7 +213,7 @@ def test_what_is_neither_likely_nor_shown_elsewhere_is_not_named(
     situation = rows_of("five_bar", 100, 40)
 
     def weak(analysis: Analysis) -> Judgement:
-        atoms = analysis.dictionary.atoms
+        atoms = analysis.atoms
         found = next(f for f in analysis.found if [atoms[i].name for i in f.members] == ["joint_gain"])
         return replace(judge(analysis), found=found, names=("joint_gain",), probability=probability)
 

@@ -13,7 +13,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.library import has_usual_shape
-from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet, dictionary_of, singles_of
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.diagnosis.search.convergence import (
     discrepancy_is_active,
@@ -22,8 +21,9 @@ from ccnn_torch.diagnosis.search.convergence import (
     known_shapes,
     most_probable_shapes,
 )
-from ccnn_torch.diagnosis.search.sets import scored
 from ccnn_torch.effects import make_effect
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, dictionary_of, singles_of
+from ccnn_torch.evidence.sets import scored
 
 ROWS, CHANNELS = 100, 2
 
@@ -51,7 +51,7 @@ def looked_at() -> tuple[Dictionary, Tensor, list[FittedSet]]:
 def test_shapes_of_what_is_out_of_play_are_not_looked_for_again(sought: frozenset[str] | None) -> None:
     dictionary, _, found = looked_at()
     assert found[0].members == (1,)
-    known = known_shapes(dictionary, found, found[0], sought)
+    known = known_shapes(dictionary.atoms, found, found[0], sought)
     shapes = {name: [float(a.shape) for a in atoms] for name, atoms in known.items()}
     assert len(shapes.pop("thermal")) == 1, "it adds nothing beside what acts, and stays with one shape"
     # Backlash acts, drift does it nearly as well: they keep all shapes, unless these are looked for.
@@ -61,7 +61,7 @@ def test_shapes_of_what_is_out_of_play_are_not_looked_for_again(sought: frozense
 
 def test_the_likeliest_shape_of_an_effect_is_that_of_its_best_set() -> None:
     dictionary, _, found = looked_at()
-    likely = most_probable_shapes(dictionary, found)
+    likely = most_probable_shapes(dictionary.atoms, found)
     assert set(likely) == {"backlash", "drift", "thermal"}
     assert float(likely["backlash"].shape) == 1.0 and float(likely["drift"].shape) == 3.0
 
@@ -118,7 +118,7 @@ def test_what_does_not_act_keeps_few_shapes_and_that_of_the_textbook() -> None:
     said = diagnose_rows(situation, measured(situation, {"joint_gain": 12.0}, 4))
     assert said.verdict["effects"] == ["joint_gain"]
     shapes: dict[str, list[Atom]] = {}
-    for atom in said.analysis.dictionary.atoms:
+    for atom in said.analysis.atoms:
         if atom.effect is not None and atom.shape.numel():
             shapes.setdefault(atom.name, []).append(atom)
     for name in ("backlash", "friction"):

@@ -19,8 +19,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records
 from ccnn_torch.report.json_files import plain
-from ccnn_torch.simulation.job import simulate_records
-from ccnn_torch.simulation.outputs import write_simulated
+from ccnn_torch.simulation.job import simulate_records, write_simulated
 
 
 @pytest.mark.parametrize(

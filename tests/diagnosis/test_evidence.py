@@ -12,12 +12,12 @@ from scipy.stats import multivariate_normal
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns
-from ccnn_torch.diagnosis.evidence.batched_sets import column_indices
-from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, dictionary_of, singles_of
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, fit_single_groups, own_products
-from ccnn_torch.diagnosis.search.sets import promising, scored
 from ccnn_torch.effects import make_effect
+from ccnn_torch.evidence.batched_sets import column_indices
+from ccnn_torch.evidence.dictionary import Dictionary, dictionary_of, singles_of
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.evidence.sets import promising, scored
+from ccnn_torch.evidence.single_groups import NO_COLUMNS, fit_single_groups, own_products
 
 
 def _columns(seed: int, rows: int, width: int) -> torch.Tensor:

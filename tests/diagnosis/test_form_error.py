@@ -9,9 +9,9 @@ from diagnosis.test_convergence import looked_at
 from torch import Tensor
 
 from ccnn_torch.diagnosis import diagnose_rows
-from ccnn_torch.diagnosis.evidence.dictionary import dictionary_of, singles_of, with_noise
-from ccnn_torch.diagnosis.search.beam import probable_sets
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.beam import probable_sets
+from ccnn_torch.evidence.dictionary import dictionary_of, singles_of, with_noise
 
 
 def test_sets_under_a_known_noise_are_those_of_scaled_data() -> None:

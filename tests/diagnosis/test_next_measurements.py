@@ -14,11 +14,11 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
 from ccnn_torch.diagnosis.design.next_measurements import _candidates, _columns, _possible
-from ccnn_torch.diagnosis.evidence.dictionary import FittedSet, covariance
 from ccnn_torch.diagnosis.page.data import About
 from ccnn_torch.diagnosis.page.localisation import write_next_csv
 from ccnn_torch.effects import Situation
 from ccnn_torch.effects.covariates import covariate_units
+from ccnn_torch.evidence.dictionary import FittedSet, covariance
 from ccnn_torch.records import read_table, stack_columns
 
 EXACT = torch.full((3,), NOISE, dtype=torch.float64)
@@ -71,7 +71,7 @@ def test_chosen_rows_say_more_together_than_any_drawn_at_random_would() -> None:
     wanted = said.next_measurements
 
     def names(found: FittedSet) -> set[str]:
-        return {analysis.dictionary.atoms[i].name for i in found.members}
+        return {analysis.atoms[i].name for i in found.members}
 
     first, *others = [one for _, drivers, _, one in said.judgement.leading if not drivers]
     second = next(one for one in others if sorted(names(first) ^ names(one)) == wanted[0]["separates"])

@@ -10,10 +10,10 @@ from diagnosis.test_convergence import columns, looked_at
 from torch import Tensor
 
 from ccnn_torch.diagnosis import diagnose_rows
-from ccnn_torch.diagnosis.evidence.beside import gain_beside
-from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, fit_single_groups, own_products
 from ccnn_torch.diagnosis.residual.noise_evidence import noise_of_repeats
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.beside import gain_beside
+from ccnn_torch.evidence.single_groups import NO_COLUMNS, fit_single_groups, own_products
 
 
 def measured(situation: Situation, change: Tensor, times: float, seed: int) -> Tensor:
@@ -108,4 +108,4 @@ def test_a_load_that_moves_no_joint_is_no_error() -> None:
     found = diagnose_rows(more, reached_with(more, [acting(more, "backlash", q1=6e-4)], 3))
     assert found.verdict["effects"] == ["backlash"]
     # Its torques on the joints, all 0, are no columns.
-    assert all(bool(a.columns.any()) for a in found.analysis.dictionary.atoms)
+    assert all(bool(a.columns.any()) for a in found.analysis.atoms)

@@ -17,8 +17,7 @@ from ccnn_torch.effects import Situation
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records
-from ccnn_torch.simulation.job import simulate_records
-from ccnn_torch.simulation.outputs import write_simulated
+from ccnn_torch.simulation.job import simulate_records, write_simulated
 
 EXACT = torch.full((3,), NOISE, dtype=torch.float64)
 

@@ -23,8 +23,7 @@ from ccnn_torch.effects import (
     signature,
 )
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
-from ccnn_torch.effects.lag import lagged, velocity
-from ccnn_torch.effects.thermal import REFERENCE
+from ccnn_torch.effects.time import REFERENCE, lagged, velocity
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
@@ -109,7 +108,8 @@ def test_what_gives_under_a_load_obeys_maxwell_and_betti(name: str) -> None:
     pair[1] = replace(pair[0], covariates=pair[1].covariates)
     effect = make_effect("compliance")
     first, second = (columns(effect, rows, NO_SHAPE) for rows in pair)
-    linear = [n for n in first if not n.endswith(("stiffening", "hardening"))]
+    # A load that acts elsewhere does its work elsewhere, too.
+    linear = [n for n in first if not n.endswith(("stiffening", "hardening")) and " load " not in n]
     assert len(linear) > len(pair[0].mechanism.joints)
     for column in linear:
         one = (pair[1].wrench * first[column]).sum(-1)
@@ -117,6 +117,27 @@ def test_what_gives_under_a_load_obeys_maxwell_and_betti(name: str) -> None:
         assert torch.allclose(one, other, rtol=1e-8, atol=1e-12), column
         # A spring takes work up.
         assert bool(((pair[0].wrench * first[column]).sum(-1) >= -1e-12).all()), column
+
+
+def test_a_load_beside_the_measured_point_of_an_arm_does_work_where_it_acts() -> None:
+    """Joints that give under a force 8 cm away, by the slope of that point's work: two columns of a joint, one for
+    each place of the force, are the joint's under the force where it acts."""
+    rows = situation(ARM)
+    arm, away = rows.mechanism, torch.tensor([0.03, -0.05, 0.06], dtype=torch.float64)
+    assert isinstance(arm, SerialArm)
+    rows = replace(rows, covariates={k: v for k, v in rows.covariates.items() if k in ("load_x", "load_y", "load_z")})
+
+    def place(joints: Tensor) -> Tensor:
+        point, rotation = arm.forward_frame(joints)
+        return point + rotation @ away
+
+    found = columns(make_effect("compliance"), rows, NO_SHAPE)
+    for i, joint in enumerate(arm.joints):
+        step = 1e-6 * torch.eye(len(arm.joints), dtype=torch.float64)[i]
+        torque = (rows.wrench[:, :3] * (place(rows.joints + step) - place(rows.joints - step))).sum(-1) / 2e-6
+        beside = sum((found[f"{joint.name} load {axis}"] * d for axis, d in zip("xyz", away, strict=True)))
+        expected = rows.jacobian[..., i] * torque[:, None]
+        assert torch.allclose(found[joint.name] + beside, expected, rtol=1e-6, atol=1e-6), joint.name
 
 
 def test_a_linear_spring_is_twice_as_far_out_under_twice_the_load_and_a_stiffening_one_four_times() -> None:

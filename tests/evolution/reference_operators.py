@@ -26,20 +26,6 @@ def crossover(first: Strings, second: Strings, cuts: list[int]) -> tuple[Strings
     return children[0], children[1]
 
 
-def uniform_crossover(first: Strings, second: Strings, swap: list[bool]) -> tuple[Strings, Strings]:
-    """Exchange single genes."""
-    bits: list[list[str]] = [[], []]
-    weights: list[list[float]] = [[], []]
-    left = (list(first[1]), list(second[1]))
-    for place, exchanged in enumerate(swap):
-        for parent, (string, queue) in enumerate(zip((first[0], second[0]), left, strict=True)):
-            child = 1 - parent if exchanged else parent
-            bits[child].append(string[place])
-            if string[place] == "1":
-                weights[child].append(queue.pop(0))
-    return ("".join(bits[0]), weights[0]), ("".join(bits[1]), weights[1])
-
-
 def flip(strings: Strings, flips: list[bool], fresh: list[float]) -> Strings:
     """Bit-flip mutation: insert a weight for a bit that becomes 1, delete that of one that becomes 0."""
     bits, weights = "", []

@@ -10,11 +10,12 @@ from naive_network import output, random_layers
 from torch import Tensor
 
 from ccnn_torch.evolution.breeding import BreedingDraws, breed_networks, breeding_shapes, initial_population
-from ccnn_torch.evolution.evaluation import make_task, network_errors
+from ccnn_torch.evolution.evaluation import EPSILON, make_task, network_errors
 from ccnn_torch.evolution.genome import Genome, active
 from ccnn_torch.evolution.random import uniform_parts
+from ccnn_torch.evolution.settings import ENNSettings
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.learners.enn import ENN, ENNSettings
+from ccnn_torch.learners.enn import ENN
 
 SMALL = ENNSettings(hidden=(4, 3), population=24, generations=15, density=0.6)
 
@@ -56,7 +57,7 @@ def test_every_network_has_the_error_it_has_alone(hidden: list[int], bias: bool,
 
 def test_layers_of_a_child_come_from_the_same_two_parents() -> None:
     """Every parent carries its number as its weights; nothing is cut inside a layer and nothing mutates by a step."""
-    settings = ENNSettings(population=12, density=1.0, structural_mutation=0.0, cuts=2, crossover_kind="uniform")
+    settings = ENNSettings(population=12, density=1.0, structural_mutation=0.0)
     layers = [
         initial_population(3, 2, settings, torch.arange(2), 1),
         initial_population(1, 3, settings, torch.arange(2), 2),
@@ -84,7 +85,7 @@ def test_fitness_never_falls_and_is_that_of_the_model() -> None:
     best = torch.stack([metrics["fitness_best"] for metrics in history])
     assert bool((best[1:] >= best[:-1]).all()) and bool((best[-1] > best[0]).all())
     error = (learner.predict(data.inputs) - data.targets).norm(dim=-1).mean(1)
-    torch.testing.assert_close(best[-1], 1 / (error + SMALL.epsilon), rtol=1e-12, atol=0)
+    torch.testing.assert_close(best[-1], 1 / (error + EPSILON), rtol=1e-12, atol=0)
     assert torch.equal(history[-1]["evaluations"], torch.full((3,), 16 * 24, dtype=torch.float64))
     state = learner.state_dict()
     # The best network stands in the population; a place without a connection holds 0.

@@ -6,8 +6,7 @@ import naive_network as naive
 import onnxruntime
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from torch import Tensor
 
 from ccnn_torch.compensation.export.to_onnx import to_onnx

@@ -7,8 +7,7 @@ import math
 import pytest
 import reference_operators as reference
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from torch import Tensor
 
 from ccnn_torch.evolution import Genome, decode, encode
@@ -74,28 +73,12 @@ def test_point_crossover_is_the_equivalent_crossover_of_the_strings(situation: S
     first, second, bias, generator = situation
     shape = first.weight.shape[-2:]
     draws = rand((*LEAD, count), generator)
-    swap = swap_genes("point", draws, math.prod(shape)).unflatten(-1, shape)
+    swap = swap_genes(draws, math.prod(shape)).unflatten(-1, shape)
     one, two = crossover(first, second, swap)
     expected = []
     for a, b, draw in zip(individuals(first), individuals(second), draws.flatten(0, 1).tolist(), strict=True):
         cuts = [1 + int(value * (math.prod(shape) - 1)) for value in draw]
         expected.append(reference.crossover(strings(a, bias), strings(b, bias), cuts))
-    check(one, [pair[0] for pair in expected], bias)
-    check(two, [pair[1] for pair in expected], bias)
-
-
-@settings(max_examples=40, deadline=None)
-@given(situations())
-def test_uniform_crossover_exchanges_genes_with_their_weights(situation: Situation) -> None:
-    first, second, bias, generator = situation
-    shape = first.weight.shape[-2:]
-    draws = rand((*LEAD, math.prod(shape)), generator)
-    swap = swap_genes("uniform", draws, math.prod(shape))
-    one, two = crossover(first, second, swap.unflatten(-1, shape))
-    expected = [
-        reference.uniform_crossover(strings(a, bias), strings(b, bias), row)
-        for a, b, row in zip(individuals(first), individuals(second), (draws < 0.5).flatten(0, 1).tolist(), strict=True)
-    ]
     check(one, [pair[0] for pair in expected], bias)
     check(two, [pair[1] for pair in expected], bias)
 
@@ -191,7 +174,7 @@ def test_single_point_crossover_on_the_papers_strings() -> None:
     """Section III-D: cut 011 001 100 after its fourth bit; two ones stand before the cut, so two weights do."""
     first = decode("011 001 100", [-0.3, 0.3, -0.1, 0.4])
     second = decode("100 111 010", [1.0, 2.0, 3.0, 4.0, 5.0])
-    swap = swap_genes("point", torch.tensor([[3.5 / 8]], dtype=torch.float64), 9).view(3, 3)
+    swap = swap_genes(torch.tensor([[3.5 / 8]], dtype=torch.float64), 9).view(3, 3)
     one, two = crossover(first, second, swap)
     assert encode(*one) == ("011 011 010", [-0.3, 0.3, 3.0, 4.0, 5.0])
     assert encode(*two) == ("100 101 100", [1.0, 2.0, -0.1, 0.4])

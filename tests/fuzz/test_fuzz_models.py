@@ -9,12 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from ccnn_torch import calibrate, identify
-from fuzz.mutate import TOKENS, bytes_changes, change_bytes, change_table, table_changes, text_changes
-from fuzz.mutate import change_text as change
+from fuzz.mutate import (
+    TOKENS,
+    bytes_changes,
+    change_bytes,
+    change_table,
+    change_text as change,
+    table_changes,
+    text_changes,
+)
 from fuzz.oracle import columns, judged
 
 pytestmark = pytest.mark.fuzz

@@ -14,8 +14,7 @@ from xml.etree import ElementTree
 
 import pytest
 from blark.parse import parse_source_code
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 from kinds import KINDS
 from machines import known
 from stand_ins import fields

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 from kinds import KINDS, little
 from numpy.typing import NDArray
 from structured_text import Instance, parse_blocks

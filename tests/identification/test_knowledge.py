@@ -19,7 +19,6 @@ from ccnn_torch.identification import (
     inverse_problem,
     require_identifiable,
     solve_lm,
-    solve_per_leg,
     what_is_known,
 )
 
@@ -31,7 +30,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(kind: str) -> None:
     per_leg = kind != "known noise"
     noise = None if kind == "unknown noise" else NOISE
     problem = inverse_problem(rows.mechanism, rows.joints, rows.pose, pose_noise=noise, per_leg=per_leg)
-    fit = solve_per_leg(solve_lm, problem, 0) if kind == "per leg" else solve_lm(problem)
+    fit = solve_lm(problem)
     assert bool(fit.converged.all())
     known = what_is_known(problem, fit.values)
     held = ((fit.values - rows.truth).abs() <= known.half_width(0.95)).to(torch.float64).mean(0)

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 import torch
 from linkages import NOISE, measured
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import (
-    Fit,
     ParameterChoice,
-    Problem,
-    Progress,
     forward_problem,
     inverse_problem,
     solve_lm,
-    solve_per_leg,
     split_by_leg,
 )
 from ccnn_torch.mechanisms import load_mechanism
@@ -27,15 +21,17 @@ from ccnn_torch.mechanisms import load_mechanism
 def test_legs_apart_are_legs_together(name: str) -> None:
     rows = measured(3, 40, 1, name=name)
     problem = inverse_problem(rows.mechanism, rows.joints, rows.pose, pose_noise=NOISE, per_leg=True)
-    shares: list[float] = []
-    apart, together = solve_per_leg(solve_lm, problem, 0, shares.append), solve_lm(problem)
-    torch.testing.assert_close(apart.cost, together.cost, rtol=1e-7, atol=0)
-    torch.testing.assert_close(apart.values, together.values, rtol=0, atol=1e-5)
-    assert bool(apart.converged.all())
-    assert shares == sorted(shares) and shares[-1] == 1.0
+    parts, together = split_by_leg(problem), solve_lm(problem)
+    apart = [solve_lm(part) for part in parts]
+    torch.testing.assert_close(sum(fit.cost for fit in apart), together.cost, rtol=1e-7, atol=0)
+    names = [p.name for part in parts for p in part.parameters]
+    order = [names.index(p.name) for p in problem.parameters]
+    values = torch.cat([fit.values for fit in apart], dim=-1)[:, order]
+    torch.testing.assert_close(values, together.values, rtol=0, atol=1e-5)
+    assert all(bool(fit.converged.all()) for fit in apart)
 
 
-def test_a_leg_has_its_own_parameters_channels_and_seed() -> None:
+def test_a_leg_has_its_own_parameters_channels() -> None:
     rows = measured(1, 20, 2)
     problem = inverse_problem(rows.mechanism, rows.joints, rows.pose, pose_noise=NOISE, per_leg=True)
     first, second = split_by_leg(problem)
@@ -45,15 +41,6 @@ def test_a_leg_has_its_own_parameters_channels_and_seed() -> None:
     whole = problem.residual(point, *problem.data)
     torch.testing.assert_close(first.residual(point[..., :6], *first.data), whole[..., :1], rtol=0, atol=0)
     torch.testing.assert_close(second.residual(point[..., 6:], *second.data), whole[..., 1:], rtol=0, atol=0)
-
-    seeds: list[int] = []
-
-    def failing(part: Problem, seed: int, progress: Progress | None = None) -> Fit:
-        seeds.append(seed)
-        return dataclasses.replace(solve_lm(part), message=f"number {seed}")
-
-    assert solve_per_leg(failing, problem, 7).message == "leg 1: number 7"
-    assert seeds == [7, 8]
 
 
 def test_one_leg_alone_leaves_the_other_joint_out() -> None:
@@ -83,7 +70,7 @@ def test_what_ties_the_legs_is_named() -> None:
     joints = tripod.sample_joints(9, torch.Generator().manual_seed(0))
     common = inverse_problem(tripod, joints, tripod.forward_kinematics(joints), per_leg=True)
     with pytest.raises(InputError, match="parameter 'L' belongs to no single leg"):
-        solve_per_leg(solve_lm, common, 0)
+        split_by_leg(common)
 
 
 def test_a_leg_with_too_few_rows_is_refused() -> None:

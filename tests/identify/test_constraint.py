@@ -13,14 +13,10 @@ from frozen import frozen
 
 from ccnn_torch.cli import main
 from ccnn_torch.compensation import load_compensation
+from ccnn_torch.config.keys import list_keys
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import tool_points
-from ccnn_torch.identification.config import (
-    describe_identify_keys,
-    dump_identify_config,
-    load_identify_config,
-    make_identify_config,
-)
+from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import Identification, identify
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
@@ -114,10 +110,10 @@ def test_the_machine_is_a_model_for_commands(folder: Path) -> None:
 
 
 def test_the_experiment_is_the_same_when_written_and_read_back(tmp_path: Path) -> None:
-    config = load_identify_config(SOCKETS)
-    (tmp_path / "config.yaml").write_text(dump_identify_config(config))
-    assert load_identify_config(tmp_path / "config.yaml") == config
-    assert {"constraint.kind", "constraint.where"} <= {key for key, _, _ in describe_identify_keys()}
+    config = IdentifyConfig.from_file(SOCKETS)
+    (tmp_path / "config.yaml").write_text(config.to_yaml())
+    assert IdentifyConfig.from_file(tmp_path / "config.yaml") == config
+    assert {"constraint.kind", "constraint.where"} <= {key for key, _, _ in list_keys(IdentifyConfig)}
 
 
 def simulated(kind: str, folder: Path) -> Identification:
@@ -147,7 +143,9 @@ def simulated(kind: str, folder: Path) -> Identification:
     columns |= {f"{name}[mm]": np.concatenate([1e3 * said.numpy(), np.full(80, 7.0)])}
     write_table(folder / "rows.csv", columns)
     constraint = {"kind": kind, "where": {"robot": 1}, "tolerance": {"m": "1 mm", "rad": 1e-3}}
-    return identify(make_identify_config(mechanism=str(ARM), records=str(folder / "rows.csv"), constraint=constraint))
+    return identify(
+        IdentifyConfig.from_keys(mechanism=str(ARM), records=str(folder / "rows.csv"), constraint=constraint)
+    )
 
 
 @pytest.mark.parametrize("kind", ["distances", "plane"])
@@ -207,7 +205,7 @@ def test_what_cannot_be_used_is_one_sentence(
 def test_too_few_rows_are_refused(tmp_path: Path) -> None:
     lines = DATA.read_text().splitlines()
     (tmp_path / "few.csv").write_text("\n".join([lines[0], *lines[1:6:2]]) + "\n")
-    config = make_identify_config(
+    config = IdentifyConfig.from_keys(
         mechanism=str(ARM), records=str(tmp_path / "few.csv"), constraint={}, split={"test": 0.4}
     )
     with pytest.raises(InputError, match="1 rows of 3 equations cannot determine 6 free parameters"):
@@ -217,7 +215,7 @@ def test_too_few_rows_are_refused(tmp_path: Path) -> None:
 def test_given_noise_and_a_fixed_tool_are_kept() -> None:
     about = {"kind": "sockets", "tolerance": 1e-3, "plate_tolerance": 1e-5}
     fixed = identify(
-        make_identify_config(
+        IdentifyConfig.from_keys(
             mechanism=str(ARM),
             records=str(DATA),
             constraint=about,
@@ -233,9 +231,9 @@ def test_given_noise_and_a_fixed_tool_are_kept() -> None:
 
 def test_rows_of_another_machine_are_one_sentence() -> None:
     """The singular value decomposition behind a plate's start met NaN: joints of an arm have no pose of a five-bar."""
-    config = load_identify_config(SOCKETS, ["mechanism=five_bar"])
+    config = IdentifyConfig.from_file(SOCKETS, ["mechanism=five_bar"])
     with pytest.raises(InputError, match="a column 'q3', and the machine has 2 joints"):
         identify(config)
-    config = load_identify_config(SOCKETS, ["mechanism=five_bar", "columns={q3: ignore}"])
+    config = IdentifyConfig.from_file(SOCKETS, ["mechanism=five_bar", "columns={q3: ignore}"])
     with pytest.raises(InputError, match=r"row \d+: mechanism 'five_bar' .* is out of reach at q1 = "):
         identify(config)

@@ -8,7 +8,7 @@ import torch
 
 import ccnn_torch
 from ccnn_torch.errors import InputError, MethodFailedError
-from ccnn_torch.identification.config import make_identify_config
+from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.job import start_identification
 from ccnn_torch.mechanisms import Framed, load_mechanism
@@ -88,7 +88,7 @@ def test_points_in_a_plane_keep_the_side_of_its_normal() -> None:
 
 
 def test_a_search_that_did_not_converge_identifies_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = make_identify_config(
+    config = IdentifyConfig.from_keys(
         mechanism="five_bar",
         records=str(records(tmp_path / "far.csv", "five_bar")),
         frame={"base": True},
@@ -133,7 +133,7 @@ def test_a_noise_that_does_not_fit_the_rows_is_doubted(tmp_path: Path) -> None:
 
 def test_an_error_that_stays_is_doubted_and_the_interval_sentence_goes(tmp_path: Path) -> None:
     path = records(tmp_path / "rows.csv", "five_bar")
-    config = make_identify_config(
+    config = IdentifyConfig.from_keys(
         mechanism="five_bar",
         records=str(path),
         frame={"base": True},

@@ -13,7 +13,7 @@ from frozen import frozen
 
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError, ModelFileError
-from ccnn_torch.identification.config import load_identify_config
+from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.job import resume_identification, start_identification
 from ccnn_torch.identification.page.report import write_identified_report
 from ccnn_torch.mechanisms import load_mechanism
@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished folder of `ccnn identify`."""
     path = tmp_path_factory.mktemp("identify")
     (path / "bar.yaml").write_text(CONFIG)
-    return start_identification(load_identify_config(path / "bar.yaml", [f"out={path / 'out'}"]), quiet=True)
+    return start_identification(IdentifyConfig.from_file(path / "bar.yaml", [f"out={path / 'out'}"]), quiet=True)
 
 
 def test_the_folder_has_everything(folder: Path) -> None:
@@ -98,7 +98,7 @@ def test_changed_data_and_damaged_files_are_refused(folder: Path, tmp_path: Path
 
 def test_a_folder_whose_data_cannot_be_used_is_free_again(tmp_path: Path) -> None:
     (tmp_path / "bar.yaml").write_text("mechanism: five_bar\nsimulate: {poses: 2}\n")
-    config = load_identify_config(tmp_path / "bar.yaml", [f"out={tmp_path / 'out'}"])
+    config = IdentifyConfig.from_file(tmp_path / "bar.yaml", [f"out={tmp_path / 'out'}"])
     with pytest.raises(InputError, match="cannot determine"):
         start_identification(config, quiet=True)
     assert not (tmp_path / "out").exists()

@@ -24,7 +24,7 @@ from ccnn_torch.calibration.page.report import make_picture, write_report
 from ccnn_torch.calibration.page.tables import result_tables, run_page, verdict, worse_text
 from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback, tags_of
 from ccnn_torch.calibration.statistics import spread
-from ccnn_torch.cli.picture import picture
+from ccnn_torch.cli.with_model import picture
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.event_file import EventFile
 from ccnn_torch.report.json_files import write_json

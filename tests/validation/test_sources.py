@@ -12,8 +12,8 @@ from ccnn_validation.sources.judge import judged
 from ccnn_validation.sources.report import figures
 from ccnn_validation.sources.run import diagnosed, source_of
 
-from ccnn_torch.diagnosis.search import form_error
 from ccnn_torch.errors import InputError
+from ccnn_torch.evidence import form_error
 
 Cli = Callable[..., tuple[int, str, str]]
 
@@ -83,7 +83,7 @@ def test_a_constant_halved_and_doubled_is_set_back(tmp_path: Path) -> None:
     assert scaled((0.9, 4, 0.2), 2.0) == (pytest.approx(0.95), 8, 0.4) and scaled(1, 0.5) == 1
     before = form_error.OF_FORM
     table = ablate(["adversarial"], 1, tmp_path, 3, "a factor of 4", "local")
-    assert [row[0] for row in table.rows] == ["search/form_error OF_EXACT, OF_FORM, OF_SMOOTH"]
+    assert [row[0] for row in table.rows] == ["evidence/form_error OF_EXACT, OF_FORM, OF_SMOOTH"]
     assert before == form_error.OF_FORM and len(list(tmp_path.glob("*.json"))) == 3
     with pytest.raises(InputError, match="no constant"):
         ablate(["adversarial"], 1, tmp_path, 3, "nobody", "local")

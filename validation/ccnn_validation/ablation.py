@@ -87,7 +87,7 @@ def scaled(value: Any, factor: float) -> Any:
 @contextmanager
 def _changed(constants: _Constants, factor: float) -> Iterator[None]:
     module, names = constants
-    home = importlib.import_module("ccnn_torch.diagnosis." + module.replace("/", "."))
+    home = importlib.import_module("ccnn_torch." + module.replace("/", "."))
     before = {name: getattr(home, name) for name in names}
     # A module that took a public one from another has it under a name of its own.
     others = [module for key, module in sys.modules.items() if key.startswith("ccnn_torch.") and module is not home]

@@ -26,6 +26,9 @@ from ccnn_torch.records.splits import Split, fold_splits
 from ccnn_torch.report.results.run import Geometry
 
 _FOLDS = 5
+# Standard errors of the folds' differences by which a larger model has to be better: one is exceeded by chance in every
+# fifth comparison of five folds, two in every seventeenth (Student's t).
+_ERRORS = 2.0
 # Rows that the comparison uses: enough to see what helps, few enough to take seconds.
 _MOST_ROWS = 600
 # The learner that is compared, and its settings: hyperparameters from few rows and steps, since there is a GP a fold.
@@ -134,7 +137,7 @@ def choose_model(
     except (InputError, MethodFailedError) as problem:
         why = f"Candidates could not be cross-validated: {problem}"
         return ModelChoice(geometry == "identify", effects[0], _ELSE, why)
-    return _chosen(errors, asked)
+    return simplest_of_best(errors, asked)
 
 
 def _errors(
@@ -220,12 +223,17 @@ def _learned(
     return predict
 
 
-def _chosen(errors: dict[Candidate, Tensor], asked: str) -> ModelChoice:
-    """The simplest that none of the later ones beats by more than a standard error of the folds' differences."""
+def simplest_of_best(errors: dict[Candidate, Tensor], asked: str) -> ModelChoice:
+    """The simplest that none of the later ones beats by more than two standard errors of the folds' differences.
+
+    Args:
+        errors: mean squared pose error by fold, `k` [m²], by candidate, the simplest first.
+        asked: what was asked for, a sentence or nothing.
+    """
     chosen, *others = errors
     for other in others:
         gain = errors[chosen] - errors[other]
-        if float(gain.mean()) > float(gain.std()) / math.sqrt(len(gain)):
+        if float(gain.mean()) > _ERRORS * float(gain.std()) / math.sqrt(len(gain)):
             chosen = other
     said = ", ".join(f"{c.words} {1e3 * math.sqrt(float(e.mean())):.3g} mm" for c, e in errors.items())
     why = f"{chosen.words.capitalize()}: the simplest of the best in cross-validation (held-out RMS: {said})."

@@ -56,9 +56,12 @@ def search_effects(
     usable, notes = usable_verdict(named, recorded)
     notes = notes if names is not None else []
     situation = on_fitted_frames(recorded)
+    fine = torch.isfinite(situation.pose).all(-1)
+    if not bool(fine.any()):
+        return None, [f"Effects were not searched: {mechanism.name} takes none of the training rows."]
     kept = () if usable is None else tuple(name for name, _ in usable.effects)
     effects = [e for e in asked if e.name in kept]
-    loose, fine = loose_parameters(situation.mechanism, identify), torch.ones(len(few), dtype=torch.bool)
+    loose = loose_parameters(situation.mechanism, identify)
     known = effects_that_pay(situation, few.pose, effects, fine, loose) if effects else []
     if not known:
         return None, ["Effects were searched in the training rows, and none pays.", *notes]

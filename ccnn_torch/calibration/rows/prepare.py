@@ -19,7 +19,7 @@ from ccnn_torch.calibration.geometry.frames import frames_of_repeats
 from ccnn_torch.calibration.geometry.physics import Physics, fit_physics, verdict_of
 from ccnn_torch.calibration.rows.dataset import Dataset, by_repeat, dataset_of
 from ccnn_torch.calibration.rows.memory import check_memory
-from ccnn_torch.config.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
+from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError
@@ -27,8 +27,7 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Column, Split
-from ccnn_torch.simulation.case_study import CaseSimulation, Simulation, simulate_realistic
-from ccnn_torch.simulation.cases import build_case
+from ccnn_torch.simulation.case_study import CaseSimulation, Simulation, build_case, simulate_realistic
 from ccnn_torch.simulation.machines.realistic import build_machine
 
 # Of the realistic machines.

@@ -8,8 +8,8 @@ needs its numbers: scalings, layers and differences in between cost nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,22 @@ _LARGEST = 200_000
 
 
 @dataclass(frozen=True)
+class Linear:
+    """A sum of products of tensors `rows x width` in the graph with matrices `width x w`, and an offset `w`."""
+
+    terms: dict[str, Tensor]
+    offset: Tensor
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> Linear:
+        """With every matrix and the offset changed alike, along their last axis."""
+        return Linear({name: change(matrix) for name, matrix in self.terms.items()}, change(self.offset))
+
+    def widened(self, wide: int) -> Linear:
+        """One of width 1, so many times."""
+        return self.mapped(lambda m: m.expand(*m.shape[:-1], wide))
+
+
+@dataclass(frozen=True)
 class Value:
     """A tensor that depends on the inputs.
 
@@ -30,15 +46,13 @@ class Value:
         shape: as in the traced example, whose number of rows stands for the batch.
         name: of the tensor in the graph; "" while it is a linear form.
         real: its shape there: 1 where it broadcasts.
-        terms: of a linear form: name of a tensor -> matrix, `width x w`.
-        offset: of a linear form, `w`.
+        form: it as a linear form, while nobody needs its numbers.
     """
 
     shape: tuple[int, ...]
     name: str = ""
     real: tuple[int, ...] = ()
-    terms: dict[str, Tensor] = field(default_factory=dict)
-    offset: Tensor | None = None
+    form: Linear | None = None
 
 
 class Graph:
@@ -70,6 +84,8 @@ class Graph:
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
             self._constants[key] = numpy_helper.from_array(array, f"c{len(self._constants)}")
+            if array.dtype.kind == "i":
+                self._integers.add(self._constants[key].name)
         return str(self._constants[key].name)
 
     def node(
@@ -80,7 +96,7 @@ class Graph:
         if key not in self._known:
             self._known[key] = name = f"v{len(self._known)}"
             self._nodes.append(helper.make_node(op, [*inputs], [name], **attributes))
-            if op == "Cast" or (op in _MOVES and inputs[0] in self._integers):
+            if (op in _MOVES and inputs[0] in self._integers) or (op == "Where" and inputs[-1] in self._integers):
                 self._integers.add(name)
             if op in _TRUTHS or (op in _MOVES and inputs[0] in self._truths):
                 self._truths.add(name)
@@ -88,13 +104,13 @@ class Graph:
 
     def solid(self, value: Value) -> Value:
         """The same with its numbers in the graph."""
-        if value.name:
+        form = value.form
+        if form is None:
             return value
-        assert value.offset is not None
-        if not value.terms:
-            return self.filled(value.offset.expand(self.rows, -1))
+        if not form.terms:
+            return self.filled(form.offset.expand(self.rows, -1))
         width, sums = value.shape[1], {}
-        units = {k: _unit(m) for k, m in value.terms.items()}
+        units = {k: _unit(m) for k, m in form.terms.items()}
         if all(units.values()) and len(units) <= 2:
             sums = dict(sorted(units.items(), key=lambda item: -item[1]))
         shape = (self.rows, width)
@@ -104,21 +120,25 @@ class Graph:
             for name in rest:
                 made = self.node("Add" if sums[name] > 0 else "Sub", [made.name, name], shape, shape)
             return (
-                self.node("Add", [made.name, self.constant(value.offset)], shape, shape) if value.offset.any() else made
+                self.node("Add", [made.name, self.constant(form.offset)], shape, shape) if form.offset.any() else made
             )
         last = ""
         # In the order in which they were made: what does not change from step to step comes first, and is made once.
-        for name in sorted(value.terms, key=self._order):
-            matrix = value.terms[name]
-            inputs = [name, self.constant(matrix)]
-            inputs += [last] if last else [self.constant(value.offset)] if value.offset.any() else []
+        for name in sorted(form.terms, key=self._order):
+            inputs = [name, self.constant(form.terms[name])]
+            inputs += [last] if last else [self.constant(form.offset)] if form.offset.any() else []
             last = self.node("Gemm", inputs, shape, shape).name
         return Value(shape, last, shape)
 
-    def whole(self, value: Value) -> Value:
-        """The same as 64-bit integers."""
-        value = self.solid(value)
-        return self.node("Cast", [value.name], value.shape, value.real, to=TensorProto.INT64)
+    def is_whole(self, value: Any) -> bool:
+        """Whether it is one of 64-bit integers."""
+        if isinstance(value, Value):
+            return value.name in self._integers
+        return isinstance(value, int) or (isinstance(value, Tensor) and value.dtype == torch.int64)
+
+    def is_truth(self, value: Value) -> bool:
+        """Whether it is one of truth values."""
+        return value.name in self._truths
 
     def full(self, value: Value) -> Value:
         """The same, not broadcast."""
@@ -139,74 +159,65 @@ class Graph:
             tensor = tensor.narrow(axis, 0, 1) if length == self.rows else tensor
         return tensor
 
-    def linear(self, value: Value) -> Value | None:
+    def linear(self, value: Value) -> Linear | None:
         """A value `rows x w` as a linear form; None where it is of another shape."""
-        if not value.name:
-            return value
+        if value.form is not None:
+            return value.form
         if len(value.shape) != 2 or len(value.real) != 2 or value.real[0] != self.rows:
             return None
         width, wide = value.real[1], value.shape[1]
         if width * wide > _LARGEST:
             return None
         matrix = torch.eye(wide, dtype=torch.float64) if width == wide else torch.ones(1, wide, dtype=torch.float64)
-        return Value(value.shape, terms={value.name: matrix}, offset=torch.zeros(wide, dtype=torch.float64))
+        return Linear({value.name: matrix}, torch.zeros(wide, dtype=torch.float64))
 
     def times(self, value: Value, matrix: Tensor) -> Value | None:
         """A linear form times a matrix `w x v`; None where that is no linear form."""
         form = self.linear(value)
-        if form is None or form.offset is None or matrix.dim() != 2:
+        if form is None or matrix.dim() != 2 or any(len(m) * matrix.shape[1] > _LARGEST for m in form.terms.values()):
             return None
-        if any(len(m) * matrix.shape[1] > _LARGEST for m in form.terms.values()):
-            return None
-        terms = {name: m @ matrix for name, m in form.terms.items()}
-        return Value((self.rows, matrix.shape[1]), terms=terms, offset=form.offset @ matrix)
+        return self._of_form(form.mapped(lambda m: m @ matrix))
 
     def scaled(self, value: Value, factor: Any) -> Value | None:
         """A linear form times a number or a row of them."""
         form, row = self.linear(value), self._row(factor, value)
-        if form is None or form.offset is None or row is None:
+        if form is None or row is None:
             return None
-        if form.shape[1] == 1 and row.dim():
-            return self.times(form, row.unsqueeze(0))
-        terms = {name: m * row for name, m in form.terms.items()}
-        return Value((self.rows, form.shape[1]), terms=terms, offset=form.offset * row)
+        if len(form.offset) == 1 and row.dim():
+            return self.times(value, row.unsqueeze(0))
+        return self._of_form(form.mapped(lambda m: m * row))
 
     def plus(self, a: Value, b: Any) -> Value | None:
         """A linear form and another one, a number or a row of them."""
-        form = self.linear(a)
-        if form is None or form.offset is None:
-            return None
+        form, other = self.linear(a), self.linear(b) if isinstance(b, Value) else None
         if not isinstance(b, Value):
             row = self._row(b, a)
-            if row is None:
-                return None
-            terms = {k: m.expand(-1, max(form.shape[1], row.numel())) for k, m in form.terms.items()}
-            return Value((self.rows, max(form.shape[1], row.numel())), terms=terms, offset=form.offset + row)
-        other = self.linear(b)
-        if other is None or other.offset is None:
+            other = None if row is None else Linear({}, row.reshape(-1))
+        if form is None or other is None:
             return None
-        wide = max(form.shape[1], other.shape[1])
-        if not {form.shape[1], other.shape[1]} <= {1, wide}:
+        wide = max(len(form.offset), len(other.offset))
+        if not {len(form.offset), len(other.offset)} <= {1, wide}:
             return None
-        terms = {name: matrix.expand(-1, wide) for name, matrix in form.terms.items()}
+        form, other = form.widened(wide), other.widened(wide)
+        terms = {**form.terms}
         for name, matrix in other.terms.items():
-            terms[name] = terms[name] + matrix if name in terms else matrix.expand(-1, wide)
-        return Value((self.rows, wide), terms=terms, offset=form.offset + other.offset)
+            terms[name] = terms[name] + matrix if name in terms else matrix
+        return self._of_form(Linear(terms, form.offset + other.offset))
 
     def beside(self, parts: Sequence[Any]) -> Value | None:
         """Linear forms and constants side by side; None where one is neither."""
         forms = [self.linear(p) if isinstance(p, Value) else self._fixed(p) for p in parts]
-        if any(form is None for form in forms):
+        kept = [form for form in forms if form is not None]
+        if len(kept) < len(forms):
             return None
-        kept = [(form, form.offset) for form in forms if form is not None and form.offset is not None]
-        wide, at = sum(len(offset) for _, offset in kept), 0
+        wide, at = sum(len(form.offset) for form in kept), 0
         terms: dict[str, Tensor] = {}
-        for form, offset in kept:
+        for form in kept:
             for name, matrix in form.terms.items():
                 whole = terms.setdefault(name, torch.zeros(len(matrix), wide, dtype=torch.float64))
-                whole[:, at : at + len(offset)] += matrix
-            at += len(offset)
-        return Value((self.rows, wide), terms=terms, offset=torch.cat([offset for _, offset in kept]))
+                whole[:, at : at + len(form.offset)] += matrix
+            at += len(form.offset)
+        return self._of_form(Linear(terms, torch.cat([form.offset for form in kept])))
 
     def model(self, outputs: Mapping[str, Value | Tensor], batch: str | int, name: str) -> onnx.ModelProto:
         """The graph with its outputs, the named ones, in order."""
@@ -248,11 +259,12 @@ class Graph:
             flat if like.shape[-1] in (1, len(flat)) and tensor.dim() <= 2 and tensor.shape[-1] == len(flat) else None
         )
 
-    def _fixed(self, constant: Any) -> Value | None:
+    def _fixed(self, constant: Any) -> Linear | None:
         tensor = torch.as_tensor(constant, dtype=torch.float64)
-        if tensor.dim() != 2 or tensor.shape[0] != self.rows:
-            return None
-        return Value(tuple(tensor.shape), offset=tensor[0])
+        return Linear({}, tensor[0]) if tensor.dim() == 2 and tensor.shape[0] == self.rows else None
+
+    def _of_form(self, form: Linear) -> Value:
+        return Value((self.rows, len(form.offset)), form=form)
 
     def _sizes(self, shape: Sequence[int]) -> str:
         """A shape with the batch of the call in it."""

@@ -10,11 +10,10 @@ from typing import Any
 import onnx
 import torch
 from torch import Tensor
-from torch.fx import Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.export.graph import Graph
-from ccnn_torch.compensation.export.operations import write_operation
+from ccnn_torch.compensation.export.operations import ByTensors
 
 # Rows of an example, or a few more.
 _LEAST = 61
@@ -60,14 +59,4 @@ class Traced:
         Raises:
             MethodFailedError: there is an operation that no file has.
         """
-        given, known = iter(inputs), dict[Node, Any]()
-        for node in self._module.graph.nodes:
-            if node.op == "placeholder":
-                known[node] = next(given)
-            elif node.op == "get_attr":
-                known[node] = getattr(self._module, node.target)
-            elif node.op == "call_function":
-                args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: known[n])
-                known[node] = write_operation(graph, node, args, kwargs)
-        found = torch.fx.node.map_arg(self._module.graph.output_node().args[0], lambda n: known[n])
-        return list(found) if isinstance(found, list | tuple) else [found]
+        return ByTensors(graph).run(self._module, inputs)

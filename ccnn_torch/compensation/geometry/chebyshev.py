@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -31,8 +32,10 @@ class ChebyshevExpansion(nn.Module):
     Attributes:
         centre, half_range: of the joints, `n` [SI].
         coefficients: `terms x o` [SI].
+        export_tolerance: share of the limit to which exports agree; sums of many terms are rounded.
     """
 
+    export_tolerance = 1e-10
     centre: Tensor
     half_range: Tensor
     coefficients: Tensor
@@ -57,6 +60,16 @@ class ChebyshevExpansion(nn.Module):
         """joints: `... x n` [SI]; returns `... x o` [SI]."""
         return self.basis(joints) @ self.coefficients
 
+    def describe(self) -> dict[str, Any]:
+        """Everything `from_description` needs; the tensors are stored beside it."""
+        return {"kind": "expanded_geometry", "joints": len(self.centre), "degree": self.degree}
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> ChebyshevExpansion:
+        """An expansion of the described size, 0 everywhere."""
+        blank = torch.ones(description["joints"], dtype=torch.float64)
+        return cls(blank.clone(), blank.clone(), description["degree"])
+
     def basis(self, joints: Tensor) -> Tensor:
         """Products of Chebyshev polynomials, `... x terms` [1]."""
         z = torch.clamp((joints - self.centre) / self.half_range, -1.0, 1.0)
@@ -74,8 +87,8 @@ class ChebyshevExpansion(nn.Module):
 def expand(
     function: Callable[[Tensor], Tensor],
     joints: Tensor,
-    margin: float,
-    what: str,
+    margin: float = 0.1,
+    what: str = "geometric deviation",
     groups: list[int] | None = None,
     worst: float = _WORST,
 ) -> ChebyshevExpansion:

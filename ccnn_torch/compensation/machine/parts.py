@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.compensation.effects.effects import Care, expand_effects, gains
-from ccnn_torch.compensation.geometry.expanded import expand_geometry
-from ccnn_torch.compensation.geometry.identified import geometric_deviation
+from ccnn_torch.compensation.geometry.chebyshev import expand
 from ccnn_torch.compensation.machine.inverse import build_machine
 from ccnn_torch.effects import Acting, Situation
-from ccnn_torch.mechanisms import SerialArm
+from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 
 # How much larger than at the rows what effects take from the kinematics may become.
@@ -43,8 +42,25 @@ def machine_parts(
         return {"machine": machine}
     geometry = None
     if not torch.equal(values, mechanism.nominal):
-        geometry = expand_geometry(geometric_deviation(mechanism, mechanism.nominal, values), rows.joints, margin)
+        geometry = expand(geometric_deviation(mechanism, mechanism.nominal, values), rows.joints, margin)
     return {"geometry": geometry, "effects": effects}
+
+
+def geometric_deviation(
+    mechanism: Mechanism, nominal: Tensor, identified: Tensor, guess: Tensor | None = None
+) -> Callable[[Tensor], Tensor]:
+    """The exact γ of one or many pairs of geometries.
+
+    Args:
+        nominal, identified: all parameters, `... x k` [SI], leading dims as the joints' to come.
+        guess: poses near which forward kinematics are solved, `... x p` [SI]; the mechanism's home when None.
+    """
+
+    def exact(joints: Tensor) -> Tensor:
+        pose = mechanism.forward_kinematics(joints, identified, guess)
+        return mechanism.wrap(mechanism.solve_inverse(pose, nominal, joints) - joints)
+
+    return exact
 
 
 def _care(rows: Situation) -> Care:

@@ -62,6 +62,12 @@ def card_of(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
         files = card.get("files") if isinstance(card, dict) else None
         if isinstance(files, dict) and digest in files.values():
             found: dict[str, Any] = card
+            for key in ("columns", "joint_map"):
+                told = found.get(key) or {}
+                if not isinstance(told, dict) or not all(isinstance(value, str) for value in told.values()):
+                    raise ModelFileError(
+                        f"{name}: {key} is no table of names and texts; take the card again from where it was written"
+                    )
             return found, text
     raise ModelFileError(
         f"{path}: its SHA-256 is in none of the cards beside it ({', '.join(name.name for name in present)}): the file "

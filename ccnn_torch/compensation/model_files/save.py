@@ -57,6 +57,17 @@ def save_model(
         InputError: a field is missing or no JSON, or the network cannot be described.
         MethodFailedError: an export does not give the model's numbers, to 1e-12 of the limit or what the network needs.
     """
+    contents = model_contents(compensator, fields, method, forms)
+    paths = {kind: Path(folder) / name for kind, (name, _) in contents.items()}
+    for kind, (_, content) in contents.items():
+        write_whole(paths[kind], content)
+    return paths
+
+
+def model_contents(
+    compensator: Compensator, fields: Mapping[str, Any], method: str = "model", forms: Collection[str] = FORMS
+) -> dict[str, tuple[str, bytes | str]]:
+    """Names and contents of what `save_model` writes, by what they are; arguments and errors as there."""
     facts = facts_of(compensator, fields)
     text = to_json(facts)
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in compensator.state_dict().items()}
@@ -69,20 +80,15 @@ def save_model(
             contents["float32.onnx"] = export_float32(compensator, text)
         except MethodFailedError as reason:
             notes.append(f"{method}.float32.onnx was not written: {reason}")
-    folder = Path(folder)
-    paths = {kind: folder / f"{method}.{kind}" for kind in contents}
-    for kind, content in contents.items():
-        write_whole(paths[kind], content)
     card = {
         **{key: value for key, value in fields.items() if key not in (*facts, *_OWN, *OPTIONAL)},
         **facts,
-        "files": {paths[kind].name: hashlib.sha256(content).hexdigest() for kind, content in contents.items()},
+        "files": {f"{method}.{kind}": hashlib.sha256(content).hexdigest() for kind, content in contents.items()},
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "notes": notes,
     }
-    paths["card"] = folder / card_name(method)
-    write_whole(paths["card"], to_json(card, indent=2) + "\n")
-    return paths
+    files = {kind: (f"{method}.{kind}", content) for kind, content in contents.items()}
+    return files | {"card": (card_name(method), to_json(card, indent=2) + "\n")}
 
 
 def settled_notes(compensator: Compensator) -> list[str]:

@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from ccnn_torch.compensation.export.export import DAMPED_TOLERANCE
-from ccnn_torch.compensation.machine.machine import ASTRAY
+from ccnn_torch.compensation.agreement import DAMPED_TOLERANCE
+from ccnn_torch.compensation.routines import Routine
 from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
-from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
+from ccnn_torch.compensation.targets.printing import (
+    ARITHMETIC,
+    Dialect,
+    Text,
+    costs,
+    print_program,
+    routine_lines,
+    within,
+    wrapped,
+)
 from ccnn_torch.compensation.targets.template import filled
 
 _NAMES = ("sqrt", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan", "floor")
 _FUNCTIONS = {name: f"{name}{{s}}({{{{0}}}})" for name in _NAMES}
 _FUNCTIONS |= {"abs": "fabs{s}({{0}})", "atan2": "atan2{s}({{0}}, {{1}})", "pow": "pow{s}({{0}}, {{1}})"}
-_OPERATIONS = {
-    "add": "({0} + {1})",
-    "sub": "({0} - {1})",
-    "mul": "({0} * {1})",
-    "div": "({0} / {1})",
-    "neg": "(-{0})",
+_OPERATIONS = ARITHMETIC | {
     "min": "ccnn_min({0}, {1})",
     "max": "ccnn_max({0}, {1})",
-    "lt": "({0} < {1})",
-    "le": "({0} <= {1})",
     "eq": "({0} == {1})",
     "and": "({0} && {1})",
     "or": "({0} || {1})",
@@ -90,7 +92,7 @@ def _header(form: Form) -> str:
         real="double" if form.dtype == "float64" else "float",
         joints=len(form.joints),
         covariates=len(form.covariates),
-        sd=form.spread is not None,
+        sd=form.sd,
     )
 
 
@@ -119,28 +121,39 @@ def c_constants(name: str, values: Array, dialect: Dialect) -> str:
 def c_compensation(form: Form, static: str = "") -> str:
     """The functions of the compensation; `static` comes before each, where they are a part of another file."""
     dialect, tables = c_dialect(form.dtype), dict[bytes, str]()
-    texts = [print_program(program, dialect, tables) for program in form.programs]
-    functions = "\n\n".join(c_function(program, text) for program, text in zip(form.programs, texts, strict=True))
-    numbers = {k: v for text in texts for k, v in text.tables.items()}
-    numbers |= {"ccnn_limit": form.limit * (1 + 1e-9)} | ({} if form.machine else {"ccnn_slack": form.slack})
-    numbers |= {} if form.spread is None else {"ccnn_fallback_sd": form.fallback_sd}
-    return filled(
-        "compensation.c.jinja",
-        static=static,
-        tables=[c_constants(name, values, dialect) for name, values in numbers.items()],
-        smaller={name: sign for name, sign in (("min", "<"), ("max", ">")) if f"ccnn_{name}(" in functions},
-        functions=functions,
-        covariates=form.covariates,
-        secant=form.secant is not None,
-        aims=form.machine.aims if form.machine else 0,
-        astray=dialect.literal(ASTRAY),
-        sd=form.spread is not None,
-        kept=form.kept,
-        steps=form.iterations,
-        rounding=dialect.literal(8 * float(np.finfo(form.dtype).eps)),
-        zero=dialect.literal(0.0),
-        s=_suffix(form),
-    )
+    texts = {name: print_program(program, dialect, tables) for name, program in form.programs.items()}
+    functions = [c_function(program, texts[name]) for name, program in form.programs.items()]
+    functions += [_routine(routine, form, dialect, static) for routine in form.routines.values()]
+    numbers = {k: v for text in texts.values() for k, v in text.tables.items()}
+    parts = [c_constants(name, values, dialect) for name, values in numbers.items()]
+    for name, sign in (("min", "<"), ("max", ">")):
+        if any(f"ccnn_{name}(" in function for function in functions):
+            head = f"static inline ccnn_real ccnn_{name}(ccnn_real a, ccnn_real b)"
+            parts.append(f"{head}\n{{\n    return a {sign} b ? a : b;\n}}")
+    return "\n\n".join([*parts, *functions]) + "\n"
+
+
+def _routine(routine: Routine, form: Form, dialect: Dialect, static: str) -> str:
+    """What a user calls; returns the status."""
+    sizes = form.sizes
+    outputs = [f"ccnn_real {name}[]" for name in routine.returns]
+    own = [name for name in form.variables(routine) if name not in routine.returns]
+    lines = [f"ccnn_real {', '.join(f'{name}[{sizes[name]}]' for name in own)};"]
+    if form.covariates:
+        value = "more[j] = covariates == NULL ? (ccnn_real)NAN : covariates[j];"
+        lines += ["ccnn_real more[CCNN_COVARIATES];", *dialect.loop("j", len(form.covariates), [value])]
+    else:
+        lines.append("(void)covariates;")
+
+    def call(name: str) -> str:
+        program = form.programs[name]
+        names = ["more" if i == "covariates" else i for i in program.inputs]
+        return f"ccnn_{name}({', '.join([*names, *program.outputs])});"
+
+    lines += routine_lines(routine, form, dialect, call, {})
+    arguments = ", ".join(["const ccnn_real given[]", "const ccnn_real covariates[]", *outputs])
+    head = f"{static}int ccnn_{routine.name}({arguments})"
+    return "\n".join([head, "{", *(f"    {line}" for line in lines), "    return (int)status[0];", "}"])
 
 
 def _suffix(form: Form) -> str:
@@ -162,7 +175,7 @@ def _selftest(form: Form, golden: Golden) -> str:
         "selftest.c.jinja",
         tables=tables,
         covariates=form.covariates,
-        sd=form.spread is not None,
+        sd=form.sd,
         count=len(golden.joints),
         relative=dialect.literal(golden.relative),
         rounding=dialect.literal(4 * float(np.finfo(form.dtype).eps)),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -13,7 +11,7 @@ from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.export.export import export_onnx
 from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry, load_compensation
 from ccnn_torch.compensation.model_files.load import LoadedModel
-from ccnn_torch.compensation.model_files.save import save_model
+from ccnn_torch.compensation.model_files.save import model_contents
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of
@@ -42,7 +40,6 @@ class _Order:
     dtype: str
     sd: bool
     allow_code: bool
-    told: str = ""
 
     def compensator(self) -> Compensator:
         if isinstance(self.model, IdentifiedGeometry):
@@ -54,7 +51,7 @@ class _Order:
     def proven(self) -> tuple[Form, Golden]:
         compensator = self.compensator()
         form = form_of(compensator, self.dtype, self.sd)
-        form.facts = [f"Compensation of the joints of {self.source()}.", *([self.told] if self.told else [])]
+        form.facts = [f"Compensation of the joints of {self.source()}."]
         if self.model.joint_map:
             counted = ", ".join(f"{joint} = {text}" for joint, text in self.model.joint_map.items())
             form.facts.append(f"Joints are the mechanism's; of what the controller shows they are {counted}.")
@@ -83,19 +80,17 @@ def _linuxcnc(order: _Order) -> dict[str, str]:
     return print_linuxcnc(form, order.mechanism(), order.source())
 
 
-def _onnx(order: _Order) -> dict[str, bytes]:
-    compensator, facts = order.compensator(), order.model.facts
-    if isinstance(order.model, IdentifiedGeometry):
+def _onnx(order: _Order) -> dict[str, bytes | str]:
+    compensator, model = order.compensator(), order.model
+    if isinstance(model, IdentifiedGeometry):
         # Nothing was measured for this file but what identified the machine.
-        facts = facts | {"metrics": {}, "data_sha256": sha256(order.path.read_bytes()).hexdigest(), "seed": 0}
-    fields = {key: facts[key] for key in ("mechanism", "metrics", "data_sha256", "seed")}
-    made = Path(tempfile.mkdtemp())
-    try:
-        paths = save_model(made, compensator, fields, forms=("onnx", "float32.onnx"))
-        files = {path.name: path.read_bytes() for path in paths.values()}
-    finally:
-        shutil.rmtree(made)
-    return files | {"controller.onnx": export_onnx(compensator, "{}", COMMAND)}
+        digest = sha256(order.path.read_bytes()).hexdigest()
+        read = {"columns": model.columns, "joint_map": model.joint_map}
+        fields = model.facts | read | {"metrics": {}, "data_sha256": digest, "seed": 0}
+    else:
+        fields = model.card
+    contents = model_contents(compensator, fields, forms=("onnx", "float32.onnx"))
+    return dict(contents.values()) | {"controller.onnx": export_onnx(compensator, "{}", COMMAND)}
 
 
 def _table(order: _Order) -> dict[str, str]:
@@ -105,7 +100,7 @@ def _table(order: _Order) -> dict[str, str]:
     return print_tables(order.compensator(), order.mechanism() if known else None)
 
 
-TARGETS: dict[str, Callable[[_Order], dict[str, str] | dict[str, bytes]]] = {
+TARGETS: dict[str, Callable[[_Order], Mapping[str, str | bytes]]] = {
     "c99": lambda order: print_c99(*order.proven()),
     "st": lambda order: print_structured_text(*order.proven()),
     "linuxcnc": _linuxcnc,

@@ -1,8 +1,8 @@
 """The form of a model that every target prints: typed operations on numbers, loops over arrays, constant tables.
 
-A `Form` has the programs of one model (inputs made finite, the deviation, its standard deviation) and the few numbers
-of the fixed point around them. A program is a list of steps in an order in which they can be computed. Each value is
-assigned once, all sizes are constants, and there is no branch: a program always does the same operations.
+A `Form` has the functions of one model (inputs made finite, a step towards the command, its end) as programs, and the
+routines that call them. A program is a list of steps in an order in which they can be computed. Each value is assigned
+once, all sizes are constants, and there is no branch: a program always does the same operations.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ccnn_torch.compensation.routines import Copy, Routine
 
 Array = NDArray[Any]
 
@@ -140,85 +142,57 @@ class Program:
 
 
 @dataclass
-class MachinePrograms:
-    """Of a machine that inverts its own forward map.
-
-    Attributes:
-        aim: ideal joints -> `aim`.
-        towards: (commanded `joints`, `correction`, `aim`, covariates) -> the next `correction`, `excess`, and `doubt`:
-            above 0 where this one is not the exact one.
-        aim_back: (commanded joints, covariates) -> `aim` of the way back, and `excess`.
-        back: (ideal `joints` tried, `correction`, `aim`) -> the next `correction`, and `doubt`.
-    """
-
-    aim: Program
-    towards: Program
-    aim_back: Program
-    back: Program
-
-    @property
-    def aims(self) -> int:
-        """How many numbers an aim has."""
-        return len(self.aim.outputs["aim"])
-
-
-@dataclass
 class Form:
-    """One model: programs and what stands around them.
+    """One model: programs, and the routines that call them.
 
     Attributes:
         joints, covariates: headers `name[unit]` in order.
         iterations: steps from the joints to their command.
+        method: whose steps these are.
         limit: of the whole |deviation|, `n` [SI].
-        slack: how far command + deviation may be from the joints before the model is not trusted, `n` [SI].
         fallback_sd: standard deviation where the deviation is taken as 0, `n` [SI].
         dtype: `float64` or `float32`.
-        clean: (given joints and covariates) -> finite `joints`, `covariates`, and how many were not, `strange`.
-        deviation: (commanded joints, covariates) -> `deviation`, and `excess`: above 0 outside the domain.
-        secant: (`found` deviation, `correction`, `steps` before) -> the next `correction` and `steps`; None where that
-            correction is the deviation that was found.
-        spread: (commanded joints, covariates) -> `sd`; None where it was not asked for.
-        machine: programs in the place of `deviation`; None without a machine.
+        programs: by name.
+        routines: by name: `compensate`, `ideal`, and `deviation_sd` where it was asked for.
         facts: lines about the model for a reader: where it came from.
     """
 
     joints: list[str]
     covariates: list[str]
     iterations: int
+    method: str
     limit: Array
-    slack: Array
     fallback_sd: Array
     dtype: str
-    clean: Program
-    deviation: Program
-    secant: Program | None
-    spread: Program | None
-    machine: MachinePrograms | None = None
+    programs: dict[str, Program]
+    routines: dict[str, Routine]
     facts: list[str] = field(default_factory=list)
 
     @property
-    def programs(self) -> list[Program]:
-        """Those that there are."""
-        deviation = [self.deviation, self.secant]
-        if self.machine is not None:
-            own = self.machine
-            deviation = [own.aim, own.towards, own.aim_back, own.back, self.secant]
-        return [p for p in (self.clean, *deviation, self.spread) if p is not None]
+    def sd(self) -> bool:
+        """Whether there is a routine for the standard deviation."""
+        return "deviation_sd" in self.routines
 
     @property
-    def kept(self) -> int:
-        """How many numbers `secant` takes with it from step to step."""
-        return len(self.secant.outputs["steps"]) if self.secant else 0
+    def sizes(self) -> dict[str, int]:
+        """Of every variable of the routines."""
+        sizes: dict[str, int] = {}
+        for program in self.programs.values():
+            sizes |= {name: program.sizes[buffer] for name, buffer in program.inputs.items()}
+            sizes |= {name: len(ids) for name, ids in program.outputs.items()}
+        return sizes
+
+    def variables(self, routine: Routine) -> list[str]:
+        """Variables that a routine makes."""
+        made = [name for call, _ in routine.calls for name in self.programs[call].outputs]
+        return [*dict.fromkeys([*made, *(part.target for part in routine.statements if isinstance(part, Copy))])]
 
     def operations(self) -> Counter[str]:
         """Of one command."""
-        count = self.clean.operations()
-        calls_of = [(self.deviation, self.iterations + 1), (self.secant, self.iterations)]
-        if self.machine is not None:
-            calls_of = [(self.machine.aim, 1), (self.machine.towards, self.iterations + 1), calls_of[1]]
-        for program, calls in calls_of:
-            for op, times in (program.operations() if program else {}).items():
-                count[op] += times * calls
+        count: Counter[str] = Counter()
+        for name, times in self.routines["compensate"].calls:
+            for op, each in self.programs[name].operations().items():
+                count[op] += each * times
         return count
 
 

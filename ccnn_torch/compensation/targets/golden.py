@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ccnn_torch.compensation.agreement import Vectors, probe_points
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import TOLERANCE
-from ccnn_torch.compensation.export.export import DAMPED_TOLERANCE, probe_points
-from ccnn_torch.compensation.targets.form import Array, Form
+from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import SINGLE_TOLERANCE
 from ccnn_torch.compensation.targets.run import run_form
 from ccnn_torch.errors import MethodFailedError
@@ -24,41 +24,14 @@ _BESIDE = {"float64": 1e-9, "float32": 1e-3}
 
 
 @dataclass(frozen=True)
-class Golden:
-    """Rows of inputs and outputs.
+class Golden(Vectors):
+    """Those of a form, with outputs as `run_form` gives them.
 
     Attributes:
-        joints: given, `s x n` [SI], with NaN and infinities.
-        covariates: `s x m` [SI].
-        outputs: as `run_form` gives them.
-        tolerance: of deviation and of ideal - joints, `n` [SI].
-        relative: of the standard deviation [1].
         hard: why single precision may not hold the model.
     """
 
-    joints: Array
-    covariates: Array
-    outputs: dict[str, Array]
-    tolerance: Array
-    relative: float
     hard: str
-
-    def errors(self, found: dict[str, Array]) -> dict[str, float]:
-        """Largest difference of each output, in units of what is allowed: above 1 is wrong."""
-        eps = 4 * np.finfo(found["command"].dtype).eps
-        worst = {}
-        for name, wanted in self.outputs.items():
-            if "status" in name:
-                worst[name] = np.inf if (found[name] != wanted).any() else 0.0
-                continue
-            extra = {"deviation": 0.0, "sd": self.relative}.get(name, eps) * np.abs(wanted)
-            apart = np.abs(found[name].astype(float) - wanted)
-            state = self.outputs["ideal_status" if name == "ideal" else "status"]
-            apart = apart / np.where(state == 3, DAMPED_TOLERANCE, 1.0)[:, None]
-            # A number that is none is wrong; a joint without deviations has no tolerance.
-            share = np.nan_to_num(apart / (self.tolerance + extra + 1e-300), nan=np.inf)
-            worst[name] = float(share.max())
-        return worst
 
 
 def golden_vectors(compensator: Compensator, form: Form) -> Golden:
@@ -77,7 +50,7 @@ def golden_vectors(compensator: Compensator, form: Form) -> Golden:
         sd = compensator.sd(*_split(given, n))
     names = ("command", "deviation", "ideal", "status", "ideal_status")
     outputs = {name: getattr(found, name).numpy() for name in names}
-    if form.spread is not None:
+    if form.sd:
         outputs["sd"] = sd.numpy()
     share = SINGLE_TOLERANCE if form.dtype == "float32" else compensator.export_tolerance
     values = given.numpy()

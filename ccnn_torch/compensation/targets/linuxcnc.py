@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ccnn_torch.compensation.targets.c99 import c_compensation, c_constants, c_dialect, c_function
 from ccnn_torch.compensation.targets.form import Form, Program
@@ -15,22 +15,6 @@ from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
 _ANGLES = ("a", "b", "c")
-
-
-class _Nominal(nn.Module):
-    """The closed direction of a mechanism: joints -> position and rotation of an arm, pose -> joints of the others."""
-
-    def __init__(self, mechanism: Mechanism) -> None:
-        super().__init__()
-        # In a tuple, so that its buffers count as constants.
-        self._mechanism = (mechanism,)
-
-    def forward(self, given: Tensor) -> Tensor:
-        (mechanism,) = self._mechanism
-        if not isinstance(mechanism, SerialArm):
-            return mechanism.solve_inverse(given)
-        position, rotation = mechanism.forward_frame(given)
-        return torch.cat([position, rotation.flatten(-2)], -1)
 
 
 def print_linuxcnc(form: Form | None, mechanism: Mechanism, source: str) -> dict[str, str]:
@@ -79,10 +63,18 @@ def _closed_form(mechanism: Mechanism) -> Program:
     example = (mechanism.home_joints if serial else mechanism.home_pose).unsqueeze(0)
     if not serial and len(mechanism.pose) != len(mechanism.joints):
         raise MethodFailedError(f"linuxcnc needs as many joints as pose coordinates; '{mechanism.name}' has others")
+
+    def nominal(given: Tensor) -> Tensor:
+        """Position and rotation of an arm at joints; joints of the others at a pose."""
+        if not isinstance(mechanism, SerialArm):
+            return mechanism.solve_inverse(given)
+        position, rotation = mechanism.forward_frame(given)
+        return torch.cat([position, rotation.flatten(-2)], -1)
+
     try:
         if type(mechanism).solve_inverse is Mechanism.solve_inverse:
             raise MethodFailedError("they are solved by iteration")
-        return traced_program(_Nominal(mechanism), (example,), "nominal", ("given",), ["found"])
+        return traced_program(nominal, (example,), "nominal", ("given",), ["found"])
     # What torch raises where a number decides how often something is done.
     except (MethodFailedError, RuntimeError) as reason:
         told = reason if isinstance(reason, MethodFailedError) else "they are solved by iteration"

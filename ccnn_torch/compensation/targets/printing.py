@@ -10,12 +10,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccnn_torch.compensation.routines import Copy, Routine, Statement
 from ccnn_torch.compensation.targets.form import BOOLEAN, Array, Expression, Form, Leaf, Let, Loop, Program, leaves
 from ccnn_torch.display import plain
 from ccnn_torch.errors import MethodFailedError
 
 # What is used once is written where it is used, up to so many characters.
 _LONGEST = 90
+# What is written alike everywhere.
+ARITHMETIC = {
+    "add": "({0} + {1})",
+    "sub": "({0} - {1})",
+    "mul": "({0} * {1})",
+    "div": "({0} / {1})",
+    "neg": "(-{0})",
+    "lt": "({0} < {1})",
+    "le": "({0} <= {1})",
+}
 # Operations as a reader counts them.
 _COUNTED = {
     "additions and multiplications": ("add", "sub", "mul", "neg"),
@@ -133,6 +144,29 @@ def print_program(program: Program, dialect: Dialect, tables: dict[bytes, str]) 
     return out
 
 
+def routine_lines(
+    routine: Routine, form: Form, dialect: Dialect, call: Callable[[str], str], places: Mapping[str, str]
+) -> list[str]:
+    """The statements of a routine.
+
+    Args:
+        call: name of a program -> line.
+        places: where variables are that are in no array of their own name.
+    """
+
+    def printed(statement: Statement) -> list[str]:
+        if isinstance(statement, str):
+            return [call(statement)]
+        if isinstance(statement, Copy):
+            target = dialect.index.format(statement.target, "j")
+            source = dialect.index.format(places.get(statement.source, statement.source), "j")
+            line = dialect.store(target, source if statement.source else dialect.literal(0.0))
+            return dialect.loop("j", form.sizes[statement.target], [line])
+        return dialect.loop("k", statement.times, [line for part in statement.statements for line in printed(part)])
+
+    return [line for statement in routine.statements for line in printed(statement)]
+
+
 def _loop_lines(step: Loop, dialect: Dialect, name: str, value: str) -> list[str]:
     at, size = [], 1
     for d, n in reversed([*enumerate(step.outer)]):
@@ -193,13 +227,12 @@ def costs(form: Form) -> list[str]:
     """Lines for the head of a file: tables, arrays and operations of one command."""
     count = form.operations()
     width = 8 if form.dtype == "float64" else 4
-    tables = {values.tobytes(): len(values) for program in form.programs for values in program.tables.values()}
-    arrays = max(sum(program.sizes[b] for b in program.buffers) for program in form.programs)
+    tables = {values.tobytes(): len(values) for program in form.programs.values() for values in program.tables.values()}
+    arrays = max(sum(program.sizes[b] for b in program.buffers) for program in form.programs.values())
     parts = {what: sum(count[op] for op in ops) for what, ops in _COUNTED.items()}
-    method = "Broyden's method" if form.secant else "Gauss and Newton's method" if form.machine else "the fixed point"
     return [
         f"Tables: {width * sum(tables.values())} bytes. Arrays at work: {width * arrays} bytes at most.",
-        f"Operations of one command ({form.iterations} steps of {method}), always the same: "
+        f"Operations of one command ({form.iterations} steps of {form.method}), always the same: "
         + ", ".join(f"{times} {what}" for what, times in parts.items() if times)
         + ".",
     ]

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
-from ccnn_torch.compensation.machine.machine import ASTRAY
-from ccnn_torch.compensation.targets.form import (
-    OPERATIONS,
-    Array,
-    Expression,
-    Form,
-    Leaf,
-    Let,
-    MachinePrograms,
-    Program,
-)
+from ccnn_torch.compensation.routines import Copy, Statement
+from ccnn_torch.compensation.targets.form import OPERATIONS, Array, Expression, Form, Leaf, Let, Program
 
 # Numbers at a time: a loop over a large table holds all its products of every row.
 _AT_ONCE = 1 << 18
+# Outputs of the way back, as a form's user calls them.
+_BACK = {"joints": "ideal", "status": "ideal_status"}
 
 
 def run_program(program: Program, inputs: dict[str, Array], dtype: str = "float64") -> dict[str, Array]:
@@ -86,88 +80,30 @@ def run_form(form: Form, joints: Array, covariates: Array | None) -> dict[str, A
         joints: ideal joints for the command and its `deviation` and `status`, commanded ones for the others, `s x n`.
         covariates: `s x m`; None where they are missing.
     """
-    n, m = len(form.joints), len(form.covariates)
-    given = np.full((len(joints), m), np.nan) if covariates is None else covariates
-    cleaned = run_program(form.clean, {"joints": joints} | ({"covariates": given} if m else {}), form.dtype)
-    q, strange = cleaned["joints"], cleaned["strange"][:, 0] > 0
-    more = {"covariates": cleaned["covariates"]} if m else {}
-
-    if form.machine is not None:
-        return _run_machine(form, form.machine, q, strange, more)
-
-    def deviation(at: Array) -> tuple[Array, Array]:
-        found = run_program(form.deviation, {"joints": at} | more, form.dtype)
-        return found["deviation"], found["excess"][:, 0]
-
-    first, first_excess = last, excess = deviation(q)
-    command, correction, steps = q, np.zeros_like(q), np.zeros((len(q), form.kept), form.dtype)
-    for _ in range(form.iterations):
-        if form.secant is None:
-            correction = last
-        else:
-            before = {"found": last, "correction": correction, "steps": steps}
-            correction, steps = run_program(form.secant, before, form.dtype).values()
-        command = q - correction
-        last, excess = deviation(command)
-    eps = np.finfo(form.dtype).eps
-    trusted = np.abs(command + last - q) <= form.slack + 8 * eps * (np.abs(q) + np.abs(last))
-    good = (trusted & (np.abs(last) <= form.limit * (1 + 1e-9))).all(-1) & ~strange
-    back = (np.abs(first) <= form.limit * (1 + 1e-9)).all(-1) & ~strange
-    out = {
-        "command": np.where(good[:, None], command, q),
-        "deviation": np.where(good[:, None], last, 0),
-        "ideal": np.where(back[:, None], q + first, q),
-        "status": np.where(strange, 2, np.where(good & (excess <= 0), 0, 1)),
-        "ideal_status": np.where(strange, 2, np.where(back & (first_excess <= 0), 0, 1)),
-    }
-    out |= _spread(form, q, strange, more)
-    assert all(value.shape[-1] == n for name, value in out.items() if "status" not in name)
+    given = np.full((len(joints), len(form.covariates)), np.nan) if covariates is None else covariates
+    out = run_routine(form, "compensate", joints, given)
+    out |= {_BACK[name]: value for name, value in run_routine(form, "ideal", joints, given).items()}
+    if form.sd:
+        out["sd"] = run_routine(form, "deviation_sd", joints, given)["sd"]
     return out
 
 
-def _spread(form: Form, q: Array, strange: Array, more: dict[str, Array]) -> dict[str, Array]:
-    """Standard deviation at commanded joints, where it was asked for."""
-    if form.spread is None:
-        return {}
-    sd = run_program(form.spread, {"joints": q} | more, form.dtype)["sd"]
-    finite = (np.isfinite(sd) & (sd >= 0)).all(-1) & ~strange
-    return {"sd": np.where(finite[:, None], sd, form.fallback_sd)}
+def run_routine(form: Form, name: str, joints: Array, covariates: Array) -> dict[str, Array]:
+    """What one routine gives: `s x n` each, and `status` `s`."""
+    routine = form.routines[name]
+    values = {"given": joints, "covariates": covariates}
 
-
-def _run_machine(
-    form: Form, machine: MachinePrograms, q: Array, strange: Array, more: dict[str, Array]
-) -> dict[str, Array]:
-    """As `run_form` for a machine, of finite joints."""
-    aim = run_program(machine.aim, {"joints": q}, form.dtype)["aim"]
-    back = run_program(machine.aim_back, {"joints": q} | more, form.dtype)
-
-    def towards(correction: Array) -> dict[str, Array]:
-        given = {"joints": q - correction, "correction": correction, "aim": aim}
-        return run_program(machine.towards, given | more, form.dtype)
-
-    def tried(correction: Array) -> dict[str, Array]:
-        given = {"joints": q - correction, "correction": correction, "aim": back["aim"]}
-        return run_program(machine.back, given, form.dtype)
-
-    out = {}
-    for names, step in ((("command", "status"), towards), (("ideal", "ideal_status"), tried)):
-        first = last = step(np.zeros_like(q))
-        correction, kept = np.zeros_like(q), np.zeros((len(q), form.kept), form.dtype)
-        for _ in range(form.iterations):
-            if form.secant is not None and step is towards:
-                before = {"found": last["correction"], "correction": correction, "steps": kept}
-                correction, kept = run_program(form.secant, before, form.dtype).values()
+    def run(statements: Sequence[Statement]) -> None:
+        for statement in statements:
+            if isinstance(statement, str):
+                program = form.programs[statement]
+                values.update(run_program(program, {key: values[key] for key in program.inputs}, form.dtype))
+            elif isinstance(statement, Copy):
+                zeros = np.zeros((len(joints), form.sizes[statement.target]), form.dtype)
+                values[statement.target] = values[statement.source] if statement.source else zeros
             else:
-                correction = last["correction"]
-            last = step(correction)
-        small = (np.abs(correction) <= form.limit * (1 + 1e-9)).all(-1, keepdims=True)
-        good = (last["doubt"] <= ASTRAY) & small
-        correction = np.where(good, correction, first["correction"])
-        excess = np.where(good, last["excess"], first["excess"]) if "excess" in last else back["excess"]
-        correction = np.where(strange[:, None], 0, correction)
-        out[names[0]] = q - correction
-        state = np.where(last["doubt"] <= 0, np.where(excess <= 0, 0, 1), 3)[:, 0]
-        out[names[1]] = np.where(strange, 2, state)
-        if names[0] == "command":
-            out["deviation"] = correction
-    return out | _spread(form, q, strange, more)
+                for _ in range(statement.times):
+                    run(statement.statements)
+
+    run(routine.statements)
+    return {key: values[key] for key in routine.returns} | {"status": values["status"][:, 0].astype(int)}

@@ -7,10 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from ccnn_torch.compensation.machine.machine import ASTRAY
+from ccnn_torch.compensation.routines import Routine
 from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
-from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
+from ccnn_torch.compensation.targets.printing import (
+    ARITHMETIC,
+    Dialect,
+    Text,
+    costs,
+    print_program,
+    routine_lines,
+    within,
+    wrapped,
+)
 from ccnn_torch.compensation.targets.template import filled
 from ccnn_torch.errors import MethodFailedError
 
@@ -25,22 +34,9 @@ def print_structured_text(form: Form, golden: Golden) -> dict[str, str]:
     """Contents of the files by name."""
     dialect, tables = _dialect(form.dtype), dict[bytes, str]()
     about = [*form.facts, "", *_units(form), "", *costs(form)]
-    text = filled(
-        "compensator.st.jinja",
-        about="\n".join(["(*", *(f"   {line}".rstrip() for line in wrapped(about)), "*)"]),
-        blocks=[_block(program, print_program(program, dialect, tables), form) for program in form.programs],
-        limit=_table("limit", form.limit * (1 + 1e-9), form),
-        slack=_table("slack", form.slack, form),
-        fallback_sd="" if form.spread is None else _table("fallback_sd", form.fallback_sd, form),
-        secant=form.secant is not None,
-        aims=form.machine.aims if form.machine else 0,
-        astray=_literal(ASTRAY, form.dtype),
-        kept=form.kept,
-        steps=form.iterations,
-        rounding=_literal(8 * float(np.finfo(form.dtype).eps), form.dtype),
-        zero=_literal(0.0, form.dtype),
-        **_sizes(form),
-    )
+    comment = "\n".join(["(*", *(f"   {line}".rstrip() for line in wrapped(about)), "*)"])
+    blocks = [_block(program, print_program(program, dialect, tables), form) for program in form.programs.values()]
+    text = "\n\n".join([comment, *blocks, *(_routine(routine, form) for routine in form.routines.values())]) + "\n"
     readme = filled("structured_text.md.jinja", real=_real(form))
     return {"compensator.st": text, "selftest.st": _selftest(form, golden), "README.md": readme}
 
@@ -73,20 +69,15 @@ def _dialect(dtype: str) -> Dialect:
     exp = f"EXP(LIMIT({literal(-_EXP[dtype])}, {{0}}, {most}))"
     one, two = literal(1.0), literal(2.0)
     twice = exp.format(f"{two} * {{0}}")
-    operations = {name: f"{name.upper()}({{0}})" for name in _NAMES} | {
-        "add": "({0} + {1})",
-        "sub": "({0} - {1})",
-        "mul": "({0} * {1})",
-        "div": "({0} / {1})",
-        "neg": "(-{0})",
+    operations = {name: f"{name.upper()}({{0}})" for name in _NAMES}
+    operations |= ARITHMETIC
+    operations |= {
         "min": "MIN({0}, {1})",
         "max": "MAX({0}, {1})",
         "exp": exp,
         "log": "LN({0})",
         "pow": "EXPT({0}, {1})",
         "tanh": f"({one} - {two} / ({one} + {twice}))",
-        "lt": "({0} < {1})",
-        "le": "({0} <= {1})",
         "eq": "({0} = {1})",
         "and": "({0} AND {1})",
         "or": "({0} OR {1})",
@@ -151,6 +142,40 @@ def _block(program: Program, text: Text, form: Form) -> str:
             *_section("VAR CONSTANT", [_table(name, values, form) for name, values in text.tables.items()]),
             *_section("VAR", variables),
             *text.lines,
+            "END_FUNCTION_BLOCK",
+        ]
+    )
+
+
+def _routine(routine: Routine, form: Form) -> str:
+    """What a user calls, as a function block; the programs are instances in it."""
+    real, sizes, dialect = _real(form), form.sizes, _dialect(form.dtype)
+    programs = dict.fromkeys(name for name, _ in routine.calls)
+    # Where a variable is: an output of an instance, or an array of its own.
+    places = {variable: f"{name}_block.{variable}_out" for name in programs for variable in form.programs[name].outputs}
+    own = [name for name in form.variables(routine) if name not in places]
+    places = {name: name for name in (*own, "covariates")} | {"given": routine.given} | places
+
+    def call(name: str) -> str:
+        given = ", ".join(f"{i} := {places[i]}" for i in form.programs[name].inputs)
+        return f"{name}_block({given});"
+
+    lines = routine_lines(routine, form, dialect, call, places)
+    for name in routine.returns:
+        lines += dialect.loop("j", sizes[name], [f"{name}[j] := {places[name]}[j];"])
+    inputs = {routine.given: len(form.joints), "covariates": len(form.covariates)}
+    outputs = [_array(name, sizes[name], real) for name in routine.returns]
+    variables = [f"    {name}_block : CCNN_{name.capitalize()}_;" for name in programs]
+    variables += [*(_array(name, sizes[name], real) for name in own), "    j, k : DINT;"]
+    return "\n".join(
+        [
+            f"(* {routine.about} *)",
+            f"FUNCTION_BLOCK CCNN_{''.join(part.capitalize() for part in routine.name.split('_'))}",
+            *_section("VAR_INPUT", [_array(name, size, real) for name, size in inputs.items()]),
+            *_section("VAR_OUTPUT", [*outputs, "    status : INT;"]),
+            *_section("VAR", variables),
+            *lines,
+            f"status := {real}_TO_INT({places['status']}[0]);",
             "END_FUNCTION_BLOCK",
         ]
     )

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects import Coefficient, Effect, Situation, signature
+from ccnn_torch.effects import EXACT, Coefficient, Effect, Situation, signature
+from ccnn_torch.evidence.form_error import OF_EXACT, OF_FORM, OF_SMOOTH
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,11 @@ class Atom:
     def is_discrepancy(self) -> bool:
         """Whether it describes something outside the library."""
         return self.effect is None
+
+    @property
+    def form_error(self) -> float:
+        """Share of its squares by which its form may be wrong in every direction."""
+        return OF_SMOOTH if self.effect is None else OF_EXACT if self.name in EXACT else OF_FORM
 
 
 def scales(coefficients: Sequence[Coefficient], like: Tensor) -> Tensor:

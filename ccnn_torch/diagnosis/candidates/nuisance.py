@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, unflatten
 
-from ccnn_torch.diagnosis.evidence.single_groups import GroupProducts, fit_single_groups
+from ccnn_torch.evidence.single_groups import GroupProducts, fit_single_groups
 
 _DIGITS = 1e-13
 # Relative ridge of the regression on a candidate.

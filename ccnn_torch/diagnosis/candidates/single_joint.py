@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
-from ccnn_torch.diagnosis.evidence.single_groups import GroupProducts, fit_single_groups, own_products
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.single_groups import GroupProducts, fit_single_groups, own_products
 
 # Spread of the log size of an effect that is in one joint or leg alone.
 _SIZE_SPREAD = 4.0

@@ -12,16 +12,16 @@ from torch import Tensor
 from ccnn_torch.diagnosis.checks.column_mistakes import column_mistake
 from ccnn_torch.diagnosis.checks.joint_scatter import joint_scatter
 from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows
-from ccnn_torch.diagnosis.evidence.dictionary import covariance
 from ccnn_torch.diagnosis.residual.distance import distance, size_of
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.shrink.held_out import Gap
 from ccnn_torch.diagnosis.verdict.findings import size_words
 from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, Judgement
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.diagnosis.verdict.plausible import implausible_size
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
+from ccnn_torch.evidence.dictionary import covariance
+from ccnn_torch.evidence.shrink import Gap
 
 # What a verdict is worth beside a caution; and beside one that says that it rests on nothing.
 _DOUBTED, _HOLLOW = 0.9, 0.5
@@ -186,7 +186,7 @@ def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Causes of the verdict that would have to be hundreds of times as large as in any machine."""
     said, most = [], implausible_size(analysis)
     for i, mean in zip(judgement.found.members, judgement.found.mean, strict=True):
-        atom = analysis.dictionary.atoms[i]
+        atom = analysis.atoms[i]
         coefficients = atom.coefficients(analysis.situation)
         if atom.name not in judgement.names or not coefficients:
             continue
@@ -208,7 +208,7 @@ def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     said, first = [], 0
     found = judgement.found
     for i, mean in zip(found.members, found.mean, strict=True):
-        atom, part = analysis.dictionary.atoms[i], slice(first, first + len(mean))
+        atom, part = analysis.atoms[i], slice(first, first + len(mean))
         first += len(mean)
         coefficients = atom.coefficients(analysis.situation)
         if atom.name not in judgement.names or not coefficients:
@@ -240,7 +240,7 @@ def _of_periods(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """A periodic error of which the rows show no more than one period: wear or a stop at one place looks like it."""
     travel = analysis.situation.joints.amax(0) - analysis.situation.joints.amin(0)
     for i in judgement.found.members:
-        atom = analysis.dictionary.atoms[i]
+        atom = analysis.atoms[i]
         if atom.name != "transmission" or atom.name not in judgement.names:
             continue
         acting = {c.joint for c in atom.coefficients(analysis.situation)}

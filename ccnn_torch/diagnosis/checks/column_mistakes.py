@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.diagnosis.residual.linearisation import signature_at
 from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.search.shared_noise import without_fitted
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
 
 # Log odds that an effect must gain by a correction, over all that was found without it: mistakes are rare.
 _GAIN = 10.0
@@ -25,7 +25,7 @@ _USED_BY = {"load_": ("compliance", "friction"), "direction": ("backlash", "fric
 
 def column_mistake(analysis: Analysis) -> str:
     """The correction of a column with which one effect explains more than all that was found; empty where none does."""
-    atoms = analysis.dictionary.atoms
+    atoms = analysis.atoms
     best = analysis.found[0].log_posterior
     likely: dict[str, Atom] = {}
     for found in analysis.found:

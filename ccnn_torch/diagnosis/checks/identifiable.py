@@ -65,7 +65,7 @@ def check_rows(
     keep = white.keep()
     spans: dict[str, Tensor] = {}
     weak = {}
-    for i, atom in enumerate(analysis.dictionary.atoms):
+    for i, atom in enumerate(analysis.atoms):
         if atom.is_discrepancy or atom.name in spans:
             continue
         x = analysis.dictionary.columns[..., analysis.dictionary.groups[i]].flatten(0, 1)

@@ -12,8 +12,7 @@ from ccnn_torch.diagnosis.residual.distance import USUAL, Size
 from ccnn_torch.effects import Situation
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Framed, SerialArm
-from ccnn_torch.mechanisms.frames.closed_form_start import best_closed_form
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form
 
 # Share of the usual distance that a fitted frame may leave.
 _LEFT = 0.1

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import scaled_signature
-from ccnn_torch.diagnosis.evidence.dictionary import FittedSet, covariance
 from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.search.sets import scored
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.dictionary import FittedSet, covariance
+from ccnn_torch.evidence.sets import scored
 from ccnn_torch.mechanisms import Mechanism
 
 _CANDIDATES = 400
@@ -81,7 +81,7 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Fitte
 
     What cannot be distinguished from the verdict is among them, even where the search did not come across it.
     """
-    atoms, own = analysis.dictionary.atoms, judgement.found
+    atoms, own = analysis.atoms, judgement.found
     plain = [
         (probability, one)
         for _, drivers, probability, one in judgement.leading
@@ -109,7 +109,7 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Fitte
 
 
 def _names(analysis: Analysis, found: FittedSet) -> set[str]:
-    return {analysis.dictionary.atoms[i].name for i in found.members}
+    return {analysis.atoms[i].name for i in found.members}
 
 
 def _candidates(analysis: Analysis, seed: int) -> Situation:
@@ -167,7 +167,7 @@ def _signatures(analysis: Analysis, found: FittedSet, situation: Situation) -> T
     """Deviation per plausible size of each coefficient of a set, `s x c0 x m` [m, rad]."""
     columns = [situation.jacobian[..., :0]]
     for i in found.members:
-        atom = analysis.dictionary.atoms[i]
+        atom = analysis.atoms[i]
         assert atom.effect is not None
         full = scaled_signature(situation, atom.effect, atom.shape)
         columns.append(full if atom.used is None else full[..., list(atom.used)])

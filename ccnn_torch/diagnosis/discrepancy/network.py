@@ -10,12 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, without
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, folds, resampled
+from ccnn_torch.diagnosis.shrink.held_out import folds
 from ccnn_torch.diagnosis.verdict.blocks import noise_floor
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, without
+from ccnn_torch.evidence.shrink import INTERVAL, resampled
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.ccnn import CCNN

@@ -60,14 +60,14 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     arrays |= _machine(situation, inside, keep)
     arrays |= {f"covariate.{name}": value for name, value in situation.covariates.items()}
     labels: dict[str, Any] = {}
-    parts = [analysis.dictionary.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
+    parts = [analysis.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
     columns = _drivers(analysis, place)
     shown = set(diagnosis.verdict["effects"]) | set(diagnosis.judgement.drivers)
     # What the whole set leaves, discrepancy term and all: the signature of one cause is drawn with all others taken
     # off.
     left = _remainder(analysis, residual, found.members, seed, with_discrepancies=True)
     for i, part in zip(found.members, parts, strict=True):
-        name = analysis.dictionary.atoms[i].name
+        name = analysis.atoms[i].name
         if name not in shown or not bool((part[keep] != 0).any()):
             continue
         # In the pose and in the joints; what follows one column best shows the cause best.
@@ -114,7 +114,7 @@ def _remainder(
     analysis: Analysis, residual: Tensor, members: tuple[int, ...], seed: int, *, with_discrepancies: bool = False
 ) -> Tensor:
     """What a set's effects leave of each row by a fit to others, `s x c0`; the residual where a row is set aside."""
-    atoms = analysis.dictionary.atoms
+    atoms = analysis.atoms
     chosen = [i for i in members if with_discrepancies or not atoms[i].is_discrepancy]
     out = residual.clone()
     keep = analysis.whitening.keep()

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.diagnosis.evidence.single_groups import (
+from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, LEAST_NOISE, MAD, NO_NOISE, Whitening, reweighted
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.evidence.single_groups import (
     NO_COLUMNS,
     Axes,
     GroupProducts,
@@ -19,7 +20,6 @@ from ccnn_torch.diagnosis.evidence.single_groups import (
     fit_single_groups,
     own_products,
 )
-from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, LEAST_NOISE, MAD, NO_NOISE, Whitening, reweighted
 
 # The richest fit: at most so many candidates, the log evidence from which one is taken in, the spread of its log size.
 _RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0

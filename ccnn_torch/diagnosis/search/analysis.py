@@ -21,14 +21,12 @@ from ccnn_torch.diagnosis.candidates.library import (
 from ccnn_torch.diagnosis.discrepancy.linear import linear_discrepancies
 from ccnn_torch.diagnosis.discrepancy.local import local_discrepancies
 from ccnn_torch.diagnosis.discrepancy.smooth import smooth_discrepancies
-from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.progress import at_step
 from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, Correlation
 from ccnn_torch.diagnosis.residual.linearisation import remainder, tangent
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.rows import frame_columns, near_singular
 from ccnn_torch.diagnosis.residual.whitening import Whitening, moving_channels, renewed, without_frames
-from ccnn_torch.diagnosis.search.beam import search
 from ccnn_torch.diagnosis.search.convergence import (
     discrepancy_is_active,
     has_new_effects,
@@ -43,6 +41,8 @@ from ccnn_torch.diagnosis.search.shared_noise import (
     without_fitted,
 )
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
+from ccnn_torch.evidence.beam import search
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
 
 # Share of the rows at which the machine must be linearised about a set; else it is so about the nominal machine.
 _LINEARISED = 0.9
@@ -66,7 +66,8 @@ class Analysis:
         measured: poses, `s x p`.
         residual: measured less nominal, `s x c0` [m, rad].
         whitening: channels, noise and row weights in the end.
-        dictionary: atoms, their columns and Gram matrices in the end.
+        atoms: candidates in the end.
+        dictionary: their columns and Gram matrices.
         y: what the atoms explain, whitened, `s x c`; rows that count.
         found: sets, most probable first.
         near_singular: `s`, bool.
@@ -84,6 +85,7 @@ class Analysis:
     measured: Tensor
     residual: Tensor
     whitening: Whitening
+    atoms: tuple[Atom, ...]
     dictionary: Dictionary
     y: Tensor
     found: list[FittedSet]
@@ -102,6 +104,11 @@ class Analysis:
         return (self.dictionary.columns, self.y) if self.shared is None else self.shared
 
     @property
+    def noise_is_known(self) -> bool:
+        """Whether the noise was given or the records show it."""
+        return self.whitening.known > 0 or self.instrument is not None
+
+    @property
     def gap(self) -> float:
         """Squares above the noise, in the units of `y`."""
         return max(float(self.dictionary.grams.yy) - self.floor * self.dictionary.grams.values, 1e-300)
@@ -110,7 +117,7 @@ class Analysis:
         """The effects of a set with their most probable numbers; discrepancy terms are left out."""
         out = []
         for i, mean in zip(found.members, found.mean, strict=True):
-            atom = self.dictionary.atoms[i]
+            atom = self.atoms[i]
             if atom.effect is not None:
                 out.append(Acting(atom.effect, atom.shape, atom.spread(self.situation, mean)))
         return out
@@ -164,7 +171,7 @@ def analyse(
     for turn in range(2):
         # The first look takes about a tenth of the time, the second of two turns is often shorter.
         at_step("searching the effects", (0.1, 0.5)[turn])
-        atoms = result.dictionary.atoms
+        atoms = result.atoms
         best = next(f for f in result.found if not any(atoms[i].is_discrepancy for i in f.members))
         if before is not None and result.found[0].log_posterior - best.log_posterior > _MUCH_LESS_PROBABLE:
             break
@@ -181,7 +188,7 @@ def analyse(
                     break
                 # Other rows are bad ones, and nothing else has changed.
                 sought = frozenset()
-            shapes = shapes._replace(kept=known_shapes(result.dictionary, result.found, best, sought))
+            shapes = shapes._replace(kept=known_shapes(result.atoms, result.found, best, sought))
         else:
             shapes = shapes._replace(starts=_kept_shapes(situation, shapes.starts, result, act))
         # A bump is not searched again where nothing outside the library does anything.
@@ -232,7 +239,7 @@ def _search_about_nominal(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analy
 def _kept_shapes(situation: Situation, starts: Sequence[Atom], result: Analysis, acting: Set[str]) -> list[Atom]:
     """Of the shapes found at first those that stay candidates: of effects that act all, since what else acts now may
     have hidden the better ones, and of the others the likeliest and that of the textbook."""
-    likely = most_probable_shapes(result.dictionary, result.found)
+    likely = most_probable_shapes(result.atoms, result.found)
     return [a for a in starts if a.name in acting or a is likely.get(a.name) or has_usual_shape(situation, a)]
 
 
@@ -296,7 +303,7 @@ def _above_instrument(result: Analysis, instrument: Tensor) -> Analysis:
 
 def _with_shared_noise(rows: _Rows, rich: Tensor, result: Analysis) -> Analysis:
     """The same candidates under noise that rows share, where the best sets found are more probable then."""
-    white, atoms = result.whitening, result.dictionary.atoms
+    white, atoms = result.whitening, result.atoms
     keep = white.keep()
     library = next(f for f in result.found if not any(atoms[i].is_discrepancy for i in f.members))
     sets = [
@@ -353,6 +360,7 @@ def _searched(
         rows.measured,
         target,
         white,
+        tuple(atoms),
         dictionary,
         y,
         found,
@@ -376,7 +384,7 @@ def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitenin
     best = result.found[0]
     left = result.residual
     for i, mean in zip(best.members, best.mean, strict=True):
-        left = left - result.dictionary.atoms[i].columns @ mean
+        left = left - result.atoms[i].columns @ mean
     free = 1 - best.effective / max(result.dictionary.grams.values, 1.0)
     left = without_frames(result.whitening, left, result.fitted)
     return renewed(result.whitening, left, result.residual, free, noise is not None, usable)

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
-from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.residual.whitening import Whitening
-from ccnn_torch.diagnosis.search.sets import subsets_with_one_less
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.evidence.sets import subsets_with_one_less
 
 # Share of the gap's energy that goes with effects that were added and not without them, below which they are no reason
 # to search again: they correct the form of the others.
@@ -84,35 +84,35 @@ def discrepancy_is_active(dictionary: Dictionary, found: Sequence[FittedSet], be
     return False
 
 
-def most_probable_shapes(dictionary: Dictionary, found: Sequence[FittedSet]) -> dict[str, Atom]:
+def most_probable_shapes(atoms: Sequence[Atom], found: Sequence[FittedSet]) -> dict[str, Atom]:
     """The most probable atom of every effect that has shapes, by name.
 
     Args:
-        dictionary: candidates.
+        atoms: candidates.
         found: sets that were tried, most probable first.
     """
     first: dict[str, Atom] = {}
-    for atom in (dictionary.atoms[i] for one in found for i in one.members):
+    for atom in (atoms[i] for one in found for i in one.members):
         if atom.effect is not None and atom.shape.numel():
             first.setdefault(atom.name, atom)
     return first
 
 
 def known_shapes(
-    dictionary: Dictionary, found: Sequence[FittedSet], best: FittedSet, sought: Set[str] | None
+    atoms: Sequence[Atom], found: Sequence[FittedSet], best: FittedSet, sought: Set[str] | None
 ) -> dict[str, list[Atom]]:
     """Effects whose shapes are not searched again, by name, with the atoms whose shapes they keep: those inactive
     with the most probable one, those active with all that they have.
 
     Args:
-        dictionary: candidates.
+        atoms: candidates.
         found: sets that were tried, most probable first.
         best: the most probable one of the library, whose effects are active.
         sought: names whose shapes are searched again; None = of all that are active.
     """
-    atoms, tried = dictionary.atoms, {f.members: f.log_posterior for f in found}
+    tried = {f.members: f.log_posterior for f in found}
     least = best.log_posterior - _BEHIND - _SHARE * max(best.log_posterior - tried[()], 0.0)
-    likely = most_probable_shapes(dictionary, found)
+    likely = most_probable_shapes(atoms, found)
     in_play = {atoms[i].name for i in best.members}
     for one in found:
         for i, others in zip(one.members, subsets_with_one_less(one.members), strict=True):

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, Correlation, targets_of
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
 
 # Correlations from row to row, and shares of the variance that readings of a target have in common.
 _FROM_ROW, _IN_TARGET = (0.3, 0.6, 0.8, 0.9, 0.95, 0.98), (0.2, 0.5, 0.8, 0.9, 0.95, 0.99)

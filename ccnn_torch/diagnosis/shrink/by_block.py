@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.diagnosis.residual.rows import frame_columns
-from ccnn_torch.diagnosis.shrink.held_out import HeldOut
 from ccnn_torch.diagnosis.verdict.blocks import Blocks
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.evidence.shrink import HeldOut
 
 _BLOCKS = 5
 # Directions of the frames with less than this share of the largest one are rounding.
@@ -35,7 +35,7 @@ def by_block(made: Blocks, residual: Tensor) -> dict[str, Any] | None:
         residual: nominal, `s x c0` [m, rad].
     """
     analysis, judgement = made.analysis, made.judgement
-    atoms = analysis.dictionary.atoms
+    atoms = analysis.atoms
     members = [i for i in judgement.found.members if atoms[i].name in judgement.names]
     white, keep = analysis.whitening, analysis.whitening.keep()
     framed, fresh = white(analysis.fitted)[keep], white(frame_columns(analysis.situation, white.weight > 0))[keep]

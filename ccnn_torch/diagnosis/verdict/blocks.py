@@ -6,13 +6,14 @@ from typing import Any
 
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.dictionary import covariance
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.shrink.held_out import Gap, HeldOut, draws, held_out, shrink_of
+from ccnn_torch.diagnosis.shrink.held_out import held_out
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.diagnosis.verdict.separability import signature_angles
 from ccnn_torch.effects import Coefficient
+from ccnn_torch.evidence.dictionary import covariance
+from ccnn_torch.evidence.shrink import Gap, HeldOut, draws, shrink_of
 
 
 class Blocks:
@@ -25,7 +26,7 @@ class Blocks:
         self.before = residual[white.keep()][:, white.channels]
         self.floor = noise_floor(analysis)
         self.position = white.channels < 3
-        atoms = analysis.dictionary.atoms
+        atoms = analysis.atoms
         self.candidates = _candidates(analysis, judgement)
         members = judgement.found.members
         alone = [[i] for i in self.candidates.values()]
@@ -40,10 +41,9 @@ class Blocks:
 
     def gap(self, held: HeldOut, position: bool, before: Tensor | None = None) -> Gap:
         """In position [m] or rotation [rad]; before: `s x c` [m, rad], None = the nominal residual."""
-        white = self.analysis.whitening
         channels = self.position if position else ~self.position
-        exact = white.known > 0 or self.analysis.instrument is not None
-        dof = 0.0 if exact else max(self.analysis.dictionary.grams.values - self.judgement.found.effective, 1.0)
+        free = self.analysis.dictionary.grams.values - self.judgement.found.effective
+        dof = 0.0 if self.analysis.noise_is_known else max(free, 1.0)
         return shrink_of(self.before if before is None else before, held, self.floor, channels, dof, self.draws)
 
     def main(self, held: HeldOut, before: Tensor | None = None) -> Gap:
@@ -118,7 +118,7 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
     With the joint, leg or link that it belongs to, and of a parameter of the mechanism what its model has.
     """
     analysis = made.analysis
-    atoms = analysis.dictionary.atoms
+    atoms = analysis.atoms
     own = made.judgement.fullest if name in made.judgement.names else made.judgement.found
     if not any(atoms[i].name == name for i in own.members):
         alone = made.candidates[name]
@@ -163,7 +163,7 @@ def _part(coefficient: Coefficient, effect: str) -> str | None:
 
 def _candidates(analysis: Analysis, judgement: Judgement) -> dict[str, int]:
     """Of each library name the atom that the verdict's set uses, or that is most probable alone."""
-    atoms = analysis.dictionary.atoms
+    atoms = analysis.atoms
     best = {atoms[i].name: i for i in judgement.found.members if not atoms[i].is_discrepancy}
     for found in analysis.found:
         if len(found.members) == 1 and not atoms[found.members[0]].is_discrepancy:

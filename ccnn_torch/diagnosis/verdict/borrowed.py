@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from ccnn_torch.diagnosis.evidence.dictionary import FittedSet
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.search.form_error import Posterior
 from ccnn_torch.diagnosis.verdict.plausible import implausible_size
+from ccnn_torch.evidence.dictionary import FittedSet
+from ccnn_torch.evidence.form_error import Posterior
 
 # Share of an effect's own squares that must not be borrowed from what other effects do.
 _OWN = 0.1
@@ -21,7 +21,7 @@ def borrowed_names(analysis: Analysis, posterior: Posterior, found: FittedSet) -
     would be of a size beside others that no cause has."""
     dictionary, names, most = posterior.dictionary, set(), implausible_size(analysis)
     for i, mean in zip(found.members, found.mean, strict=True):
-        atom, group = dictionary.atoms[i], dictionary.groups[i]
+        atom, group = analysis.atoms[i], dictionary.groups[i]
         if atom.is_discrepancy:
             continue
         coefficients = atom.coefficients(analysis.situation)

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ccnn_torch.diagnosis.discrepancy.smooth import ANY
-from ccnn_torch.diagnosis.evidence.beside import gain_beside
-from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.search.form_error import Posterior, is_unexplained, with_form_error
-from ccnn_torch.diagnosis.search.sets import scored
 from ccnn_torch.diagnosis.verdict.borrowed import borrowed_names
+from ccnn_torch.evidence.beside import gain_beside
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.evidence.form_error import Posterior, is_unexplained, with_form_error
+from ccnn_torch.evidence.sets import scored
 
 # Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
@@ -59,7 +59,7 @@ class Judgement:
 
 def judge(analysis: Analysis) -> Judgement:
     """Weigh the sets that the search has found."""
-    levels = with_form_error(analysis)
+    levels = with_form_error(analysis.dictionary, analysis.found[0], analysis.floor, analysis.noise_is_known)
     usual, likeliest = levels[0], max(levels, key=lambda level: level.weight)
     leading = _leading(analysis, levels, frozenset())
     names, drivers, _, chosen = leading[0]
@@ -77,11 +77,13 @@ def judge(analysis: Analysis) -> Judgement:
     same = (f for f in analysis.found if _named(analysis, f) == (names, drivers))
     found = max([*_refitted(analysis, [chosen]), *same], key=lambda f: f.log_posterior)
     outside = bool(drivers)
-    if not outside and is_unexplained(analysis, found):
+    if not outside and is_unexplained(analysis.dictionary, found, analysis.floor):
         outside = True
         # A set with a discrepancy term that does explain the rows goes before one that does not.
         fits = ((one, _refitted(analysis, [one[3]])[0]) for one in leading if one[1])
-        other = next(((one, fit) for one, fit in fits if not is_unexplained(analysis, fit)), None)
+        other = next(
+            ((one, fit) for one, fit in fits if not is_unexplained(analysis.dictionary, fit, analysis.floor)), None
+        )
         if other is None:
             drivers = _drivers_of_remainder(analysis, leading, usual)
         else:
@@ -112,7 +114,7 @@ def judge(analysis: Analysis) -> Judgement:
         probability=BESIDE_UNKNOWN if outside and (names or not told) else min(sum(told), 1.0),
         outside=outside,
         drivers=drivers,
-        marginal={a.name: _marginal(leading, a.name) for a in analysis.dictionary.atoms if not a.is_discrepancy},
+        marginal={a.name: _marginal(leading, a.name) for a in analysis.atoms if not a.is_discrepancy},
         leading=[
             (*one[:3], fit) for one, fit in zip(leading, _refitted(analysis, [one[3] for one in leading]), strict=True)
         ],
@@ -168,7 +170,7 @@ def _empty(analysis: Analysis) -> FittedSet:
 
 
 def _named(analysis: Analysis, found: FittedSet) -> tuple[frozenset[str], tuple[str, ...]]:
-    atoms = analysis.dictionary.atoms
+    atoms = analysis.atoms
     names = frozenset(atoms[i].name for i in found.members if not atoms[i].is_discrepancy)
     return names, tuple(_driver(analysis, atoms[i].name) for i in found.members if atoms[i].is_discrepancy)
 
@@ -179,19 +181,19 @@ def _driver(analysis: Analysis, name: str) -> str:
 
 def _leader(analysis: Analysis, kind: str) -> str:
     """Of drivers of one kind the one that explains most alone."""
-    atoms = analysis.dictionary.atoms
+    atoms = analysis.atoms
     alone = (f for f in analysis.found if len(f.members) == 1)
     names = (atoms[f.members[0]].name for f in alone)
     return next(n for n in names if n.startswith(kind) and not n.endswith(ANY))
 
 
 def _energy(analysis: Analysis, found: FittedSet, name: str) -> float:
-    return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.dictionary.atoms[i].name == name)
+    return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.atoms[i].name == name)
 
 
 def _second_driver(analysis: Analysis, posterior: Posterior, found: FittedSet) -> tuple[str, ...]:
     """What a part of the remainder follows beside the set, where that is more probable than not."""
-    dictionary, atoms, size = posterior.dictionary, analysis.dictionary.atoms, math.sqrt(posterior.variance)
+    dictionary, atoms, size = posterior.dictionary, analysis.atoms, math.sqrt(posterior.variance)
     first = next((atoms[i].name for i in found.members if atoms[i].is_discrepancy), None)
     if first is None:
         return ()
@@ -218,7 +220,7 @@ def _classes(
     analysis: Analysis, posterior: Posterior, chosen: FittedSet, names: frozenset[str]
 ) -> dict[str, tuple[str, ...]]:
     """For each name of the set those that these rows cannot distinguish from it."""
-    atoms, tried = analysis.dictionary.atoms, {f.members: f for f in posterior.found}
+    atoms, tried = analysis.atoms, {f.members: f for f in posterior.found}
     library = [i for i in posterior.dictionary.groups if not atoms[i].is_discrepancy]
     classes: dict[str, tuple[str, ...]] = {}
     least = _fits(posterior.dictionary, [chosen.members], tried)[0].log_posterior - _ODDS

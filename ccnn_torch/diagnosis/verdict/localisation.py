@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, draws
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.shrink import INTERVAL, draws
 from ccnn_torch.mechanisms import SerialArm
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")

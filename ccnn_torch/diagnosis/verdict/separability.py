@@ -25,7 +25,7 @@ def signature_angles(analysis: Analysis, judgement: Judgement) -> dict[str, dict
     Returns:
         `{effect: {other: {"angle" [rad], "separation" [1, times the noise]}}}`.
     """
-    atoms = analysis.dictionary.atoms
+    atoms = analysis.atoms
     found = judgement.found
     flat = analysis.dictionary.columns.flatten(0, 1)
 

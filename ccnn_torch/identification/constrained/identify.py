@@ -9,18 +9,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.held_out import Given, held_out_notes
+from ccnn_torch.config.split import Given, held_out_notes
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.constrained.fit import ConstraintFit, fit_constraint, held_distance
 from ccnn_torch.identification.constrained.rows import ConstraintRows, read_constraint
-from ccnn_torch.identification.doubts import doubts_of
 from ccnn_torch.identification.measured.kinematics import Kinematics
 from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.identification.measured.nominal import nominal_machine
-from ccnn_torch.identification.pose_errors import before_and_after
-from ccnn_torch.identification.result import Known, method_of, parameter_blocks, results_of
+from ccnn_torch.identification.result import Found, Known, assemble
 from ccnn_torch.identification.solve import Outcome
 from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
 
@@ -40,14 +38,14 @@ def identify_by_constraint(
     mechanism, notes = _machine(config)
     rows = read_constraint(config, mechanism, given)
     begun = time.perf_counter()
-    found = fit_constraint(config, mechanism, rows, progress)
+    fit = fit_constraint(config, mechanism, rows, progress)
     outcome = Outcome(
         machines=torch.arange(1),
-        values=found.after.geometry[None],
-        converged=found.fit.converged,
-        evaluations=found.fit.evaluations,
+        values=fit.after.geometry[None],
+        converged=fit.fit.converged,
+        evaluations=fit.fit.evaluations,
         seconds=time.perf_counter() - begun,
-        message=found.fit.message,
+        message=fit.fit.message,
     )
     held = rows.weights == 0
     notes = [*held_out_notes(config.split, int(held.sum())), *notes]
@@ -58,21 +56,15 @@ def identify_by_constraint(
         rows=Rows(rows.joints[None, ~held], rows.said[None, ~held]),
         leg_rows={},
         test=Rows(rows.joints[None, held], rows.said[None, held]),
-        start=found.before.geometry[None],
+        start=fit.before.geometry[None],
         data_hash=rows.data_hash,
         notes=notes,
     )
-    first, last = (held_distance(mechanism, rows, state)[None, held] for state in (found.before, found.after))
-    known = _known(found)
-    results = _results(config, measured, outcome, found, known, before_and_after(*map(_position, (first, last))))
-    results["constraint"] = _constraint(config, rows, found)
-    arrays = {
-        "start": measured.start,
-        "values_lm": outcome.values,
-        "correlation": known.correlation,
-        "position_before": first,
-        "position_after": last,
-    }
+    before, after = (PoseError(held_distance(mechanism, rows, s)[None, held], None) for s in (fit.before, fit.after))
+    noise = None if config.noise is None else fit.after.noise
+    found = Found(outcome, _known(fit), before, after)
+    results, arrays = assemble(config, measured, fit.selection, {"lm": found}, noise, _only_by_prior(fit, found.known))
+    results["constraint"] = _constraint(config, rows, fit)
     return measured, {"lm": outcome}, results, arrays
 
 
@@ -90,16 +82,12 @@ def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
     return arm.with_nominal(plain.nominal), [said] if ignored else []
 
 
-def _position(distance: Tensor) -> PoseError:
-    return PoseError(distance, None)
-
-
-def _known(found: ConstraintFit) -> Known:
+def _known(fit: ConstraintFit) -> Known:
     """The machine's part of what is known; a parameter that only its prior determines has no interval."""
-    k, knowledge = len(found.selection.parameters), found.knowledge
-    determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * found.after.problem.prior_sd)
+    k, knowledge = len(fit.selection.parameters), fit.knowledge
+    determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * fit.after.problem.prior_sd)
     sd = torch.where(determined, knowledge.sd, math.inf)[:, :k]
-    noise = knowledge.noise if found.after.problem.noise_known else torch.ones(1, dtype=torch.float64)
+    noise = knowledge.noise if fit.after.problem.noise_known else torch.ones(1, dtype=torch.float64)
     return Known(
         sd=sd,
         combinations=list(knowledge.combinations),
@@ -110,42 +98,22 @@ def _known(found: ConstraintFit) -> Known:
     )
 
 
-def _results(
-    config: IdentifyConfig,
-    measured: Measured,
-    outcome: Outcome,
-    found: ConstraintFit,
-    known: Known,
-    test: dict[str, Any],
-) -> dict[str, Any]:
-    prior = [
-        p.name
-        for p, sd, seen in zip(found.selection.parameters, known.sd[0], found.knowledge.identifiable[0], strict=False)
-        if bool(seen) and not math.isfinite(sd)
-    ]
-    notes = [f"lm: {outcome.message}"] if outcome.message else []
-    if prior:
-        notes.append(f"No better known than by the tolerance given: {', '.join(prior)}.")
-    doubts = doubts_of(
-        test,
-        float(known.noise),
-        float(known.freedom),
-        None if config.noise is None else found.after.noise,
-        config.noise is not None,
-    )
-    parameters = parameter_blocks(measured, found.selection, outcome, known)
-    return results_of(config, measured, parameters, known, {"lm": method_of(outcome, test, False)}, doubts, notes)
+def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
+    """A sentence on the parameters that the rows determine no better than their priors."""
+    determined = zip(fit.selection.parameters, known.sd[0], fit.knowledge.identifiable[0], strict=False)
+    prior = [p.name for p, sd, seen in determined if bool(seen) and not math.isfinite(sd)]
+    return [f"No better known than by the tolerance given: {', '.join(prior)}."] if prior else []
 
 
-def _constraint(config: IdentifyConfig, rows: ConstraintRows, found: ConstraintFit) -> dict[str, Any]:
+def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit) -> dict[str, Any]:
     """What was found of the constraint itself."""
     assert config.constraint is not None
-    k, knowledge = len(found.selection.parameters), found.knowledge
+    k, knowledge = len(fit.selection.parameters), fit.knowledge
     unknowns = {}
-    for i, parameter in enumerate(found.after.problem.parameters[k:], start=k):
+    for i, parameter in enumerate(fit.after.problem.parameters[k:], start=k):
         sd = float(knowledge.sd[0, i])
         unknowns[parameter.name] = {
-            "value": float(found.after.values[0, i]),
+            "value": float(fit.after.values[0, i]),
             "sd": sd if math.isfinite(sd) else None,
             "unit": parameter.unit,
         }
@@ -156,6 +124,6 @@ def _constraint(config: IdentifyConfig, rows: ConstraintRows, found: ConstraintF
             for number, label in rows.labels.items()
         ],
         "unknowns": unknowns,
-        "noise": found.after.noise,
+        "noise": fit.after.noise,
         "noise_known": config.noise is not None,
     }

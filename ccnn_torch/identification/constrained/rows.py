@@ -10,15 +10,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.config.held_out import Given, rows_of_test_file, split_by, with_test_file
+from ccnn_torch.config.split import Given, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.records import Records, Table, stack_columns
+from ccnn_torch.records.headers import check_joints
 from ccnn_torch.records.joint_map import read_joint_map, with_joints
-from ccnn_torch.records.pose_columns import check_joints
-from ccnn_torch.records.sources import read_source
+from ccnn_torch.records.load import read_source
 
 GROUPED_BY = {"sockets": "placement", "distances": "anchor", "plane": "plane"}
 """Column that numbers the groups of each kind, unless the config names others."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
-from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.config.sizes import sizes_of_joints, sizes_of_pose
+from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.measured.kinematics import Kinematics
@@ -25,6 +25,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
     far = []
     if isinstance(mechanism, SerialArm):
         far = judge_frames(mechanism, train.joints[0], train.observed[0], start, where=records.path)
+    joint_noise = config.joint_noise
     return Measured(
         mechanism=mechanism,
         kinematics=Kinematics(mechanism),
@@ -34,7 +35,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         test=test,
         start=start,
         pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),
-        joint_noise=_joint_noise(config, mechanism),
+        joint_noise=None if joint_noise is None else sizes_of_joints(joint_noise, mechanism.joints, "joint_noise"),
         data_hash=records.data_hash,
         notes=[*held_out_notes(config.split, test.joints.shape[1]), *_notes(records), *far],
     )
@@ -85,15 +86,6 @@ def _start(mechanism: Mechanism, rows: Rows) -> Tensor:
     if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:
         return mechanism.nominal[None].clone()
     return fit_frames(mechanism, rows.joints[0], rows.observed[0])[None]
-
-
-def _joint_noise(config: IdentifyConfig, mechanism: Mechanism) -> Tensor | None:
-    given = config.joint_noise
-    if given is None:
-        return None
-    if isinstance(given, dict):
-        return sizes_by_name(given, mechanism.joints, "joint_noise", [0.0] * len(mechanism.joints))
-    return torch.tensor([size(given, j.unit, "joint_noise") for j in mechanism.joints], dtype=torch.float64)
 
 
 def _notes(records: Records) -> list[str]:

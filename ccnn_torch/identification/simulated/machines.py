@@ -9,14 +9,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_joints, sizes_of_pose
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.identification.config import IdentifyConfig, SimulateConfig
 from ccnn_torch.identification.measured.kinematics import make_kinematics
 from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.identification.simulated.designs import choose_places, plan_places
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.simulation.instrument import Instrument, make_instrument
+from ccnn_torch.simulation.instrument import make_instrument
 from ccnn_torch.simulation.places import Places
 from ccnn_torch.simulation.random_numbers import generator_of, normal_draws
 
@@ -35,8 +35,8 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
     seeds = [config.seed + k for k in range(about.machines)]
     truth = mechanism.nominal + _errors(mechanism, about, seeds)
     instrument = make_instrument(mechanism, about.points)
-    noise = _noise(about, instrument)
-    joint_sd = _joint_noise(about, mechanism)
+    noise = sizes_of_pose(about.noise, instrument.view.pose, "simulate.noise")
+    joint_sd = sizes_of_joints(about.joint_noise, mechanism.joints, "simulate.joint_noise")
     joint_noise = joint_sd if bool((joint_sd > 0).any()) else None
     places = Places(mechanism, truth, about.box, about.circle)
     count = about.poses if poses is None else poses
@@ -89,15 +89,3 @@ def _errors(mechanism: Mechanism, about: SimulateConfig, seeds: list[int]) -> Te
         sd = factor * torch.tensor([plausible_error(p) for p in geometry], dtype=torch.float64)
     fixed = sizes_by_name(about.values, geometry, "simulate.values", [0.0] * len(geometry))
     return fixed + sd * normal_draws(sd.shape, seeds, _ERRORS, 0)
-
-
-def _noise(about: SimulateConfig, instrument: Instrument) -> Tensor:
-    return sizes_of_pose(about.noise, instrument.view.pose, "simulate.noise")
-
-
-def _joint_noise(about: SimulateConfig, mechanism: Mechanism) -> Tensor:
-    given = about.joint_noise
-    if isinstance(given, dict):
-        return sizes_by_name(given, mechanism.joints, "simulate.joint_noise", [0.0] * len(mechanism.joints))
-    sizes = [size(given, j.unit, "simulate.joint_noise") for j in mechanism.joints]
-    return torch.tensor(sizes, dtype=torch.float64)

@@ -8,19 +8,20 @@ so that it needs no schedule.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
 from ccnn_torch.evolution.operators import tournament
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
-from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
-from ccnn_torch.identification.solvers.objective import WIDTH, Objective, make_objective
+from ccnn_torch.identification.solvers.objective import WIDTH, Objective
+
+Array = NDArray[np.float64]
 
 # Streams of random numbers: the first population and the generations.
 _FIRST, _BREED = 0, 1
@@ -62,7 +63,7 @@ class HybridGenetic:
 
     def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
         """Minimise; machine i draws its numbers from seed + i alone."""
-        objective = make_objective(problem)
+        objective = Objective(problem)
         tell = progress or _silent
         share = _GENETIC_SHARE if self.sqp else 1.0
         best, cost, generations, settled = self._evolve(objective, seed, lambda done: tell(share * done))
@@ -160,27 +161,26 @@ def _one_step(objective: Objective, points: Tensor, cost: Tensor) -> tuple[Tenso
 
 
 def _one_round(objective: Objective, points: Tensor, cost: Tensor) -> tuple[Tensor, int]:
-    """SLSQP of every machine from its point; returns where it ended, `r x k`, and the number of evaluations."""
+    """SLSQP of every machine from its point: where it ended, `r x k`, and the evaluations of the slowest."""
     unit = cost.clamp_min(1e-300)
     # u = points + turn z, so that cost / unit is about 1 + gradient z + |z|² / 2.
     turn = objective.even_coordinates(points) * unit.sqrt()[:, None, None]
-    calls = 0
+    ends, calls = zip(
+        *(_search(objective.of(i), points[i], turn[i], float(unit[i])) for i in range(len(points))), strict=True
+    )
+    return torch.stack(ends), max(calls)
 
-    def evaluate(where: Array) -> list[tuple[float, Array]]:
-        nonlocal calls
-        calls += 1
-        at = points + (turn @ torch.from_numpy(where)[..., None])[..., 0]
-        there, gradient = objective.cost_and_gradient(at)
-        slope = (turn.mT @ gradient[..., None])[..., 0] / unit[:, None]
-        return list(zip((there / unit).tolist(), slope.numpy(), strict=True))
 
-    def search(machine: int, ask: Callable[[Array], tuple[float, Array]]) -> Array:
-        begin = np.zeros(points.shape[-1])
-        found = minimize(ask, begin, jac=True, method="SLSQP", options={"maxiter": 500, "ftol": 1e-15})
-        return np.asarray(found.x)
+def _search(alone: Objective, point: Tensor, turn: Tensor, unit: float) -> tuple[Tensor, int]:
+    """SLSQP of one machine in the coordinates z of `_one_round`: where it ended, `k`, and its evaluations."""
 
-    found = torch.from_numpy(run_side_by_side(search, evaluate, np.zeros(points.shape)))
-    return points + (turn @ found[..., None])[..., 0], calls
+    def evaluate(z: Array) -> tuple[float, Array]:
+        cost, gradient = alone.cost_and_gradient((point + turn @ torch.from_numpy(z))[None])
+        return float(cost) / unit, (turn.mT @ gradient[0] / unit).numpy()
+
+    options = {"maxiter": 500, "ftol": 1e-15}
+    found = minimize(evaluate, np.zeros(len(point)), jac=True, method="SLSQP", options=options)
+    return point + turn @ torch.from_numpy(found.x), int(found.nfev)
 
 
 def _message(settled: Tensor, sqp: bool) -> str:

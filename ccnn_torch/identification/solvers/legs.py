@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.linear import WeightedRows
-from ccnn_torch.identification.problems.problem import Channel, Fit, Problem, Progress, Solver, check_equations, part_of
+from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations
 
 _DEPENDS = 1e-9  # Relative size of a derivative below which it is rounding.
 
@@ -54,37 +54,6 @@ def split_by_leg(problem: Problem) -> list[Problem]:
         problems.append(_part(problem, leg, rows, columns))
         check_equations(problems[-1])
     return problems
-
-
-def solve_per_leg(solver: Solver, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
-    """Solve each leg separately and join the values.
-
-    Args:
-        solver: any.
-        problem: as `split_by_leg` takes it.
-        seed: leg number i (from 0) gets seed + i.
-        progress: called with the share that is done over all legs.
-
-    Returns:
-        Fit of all parameters: the legs' costs added, converged where all legs did, the first leg's message that says
-        something.
-
-    Raises:
-        InputError: as `split_by_leg`.
-    """
-    parts = split_by_leg(problem)
-    names = [p.name for p in problem.parameters]
-    values = problem.start.clone()
-    cost = torch.zeros_like(problem.start[:, 0])
-    converged = torch.ones_like(cost, dtype=torch.bool)
-    evaluations, message = 0, ""
-    for number, part in enumerate(parts):
-        fit = solver(part, seed + number, part_of(progress, number, len(parts)))
-        values[:, [names.index(p.name) for p in part.parameters]] = fit.values
-        cost, converged = cost + fit.cost, converged & fit.converged
-        evaluations += fit.evaluations
-        message = message or (f"leg {part.parameters[0].leg}: {fit.message}" if fit.message else "")
-    return Fit(values, cost, converged, evaluations, message)
 
 
 def _moved(problem: Problem) -> Tensor:

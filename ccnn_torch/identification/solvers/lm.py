@@ -6,15 +6,18 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.linear import WeightedRows
+from ccnn_torch.identification.problems.linear import OPEN, WeightedRows
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
-from ccnn_torch.identification.solvers.descent import descend
 from ccnn_torch.identification.solvers.robust import LOSSES, loss_weights
+from ccnn_torch.numerics.least_squares import Trial, damped_step, descend
 
 _BLOCK = 400_000  # Numbers in the Jacobian of the machines that are worked on at once: about what caches hold.
 _REACH = 3.0  # Starts lie within so many plausible errors.
 _ROUNDS = 30  # Of reweighting.
 _SETTLED = 1e-4  # Change of the weights below which reweighting ends.
+_FIRST_DAMPING, _LIGHT = 1e-8, 1e-2  # The first damping, and one that hardly shortens a step.
+_FAR = 30.0  # Plausible errors in one step that make one ask whether its direction is seen at all.
+_ROUNDING = 1e-9  # Step in plausible errors that is nothing: 1e-12 m.
 
 
 def solve_lm(
@@ -94,13 +97,9 @@ def _solve_block(
     rows: WeightedRows, begin: Tensor, block: Tensor, loss: str, max_iterations: int, tolerance: float
 ) -> tuple[Tensor, Tensor, Tensor, int]:
     """Values `r x k`, cost `r`, converged `r` and evaluations of some machines."""
-    free = rows.equations[block] - begin.shape[-1]
 
     def search(point: Tensor, extra: Tensor | None) -> tuple[Tensor, Tensor, Tensor, int]:
-        def normal(values: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            return rows.normal(values, block[index], None if extra is None else extra[index])
-
-        return descend(normal, point, rows.scale, free.clamp_min(1)[:, None], max_iterations, tolerance)
+        return _search(rows, point, block, extra, max_iterations, tolerance)
 
     x, cost, converged, count = search(begin, None)
     best = cost.argmin(-1)
@@ -120,6 +119,68 @@ def _solve_block(
             if change < _SETTLED:
                 break
     return x, rows.cost(x[:, None], block)[:, 0], converged, count
+
+
+def _search(
+    rows: WeightedRows, begin: Tensor, block: Tensor, extra: Tensor | None, max_iterations: int, tolerance: float
+) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Values `r x m x k`, cost `r x m`, converged `r x m` and evaluations of searches from `begin`, `r x m x k`.
+
+    extra: factors of the weights of the rows, `r x 1 x s` where m is 1.
+    """
+    starts = begin.shape[1]
+    machine = block.repeat_interleave(starts)
+    free = (rows.equations[machine] - begin.shape[-1]).clamp_min(1)
+    least: Tensor | None = None
+
+    def evaluate(values: Tensor, index: Tensor) -> tuple[Tensor, ...]:
+        nonlocal least
+        weights = None if extra is None else extra[index]
+        cost, gradient, matrix = (part[:, 0] for part in rows.normal(values[:, None], machine[index], weights))
+        # Of the first cost, for data without noise.
+        least = 1e-24 * cost if least is None else least
+        return cost, gradient, matrix, 2 * cost / free[index] / OPEN**2
+
+    def step_of(gradient: Tensor, matrix: Tensor, unseen: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+        ridge = (damping * matrix.diagonal(dim1=-2, dim2=-1).amax(-1)).clamp_min(1e-100)
+        step, promised = damped_step(matrix, gradient, ridge)
+        # Without a factor there is no step: a trial that is not a number is refused, and the damping grows.
+        step = torch.where((promised >= 0)[:, None], step, torch.nan)
+        far = step.abs().amax(-1) > _FAR
+        if bool(far.any()):
+            step[far], promised[far] = _seen_step(matrix[far], gradient[far], damping[far], unseen[far])
+        return rows.scale * step, promised
+
+    def settled(trial: Trial) -> Tensor:
+        assert least is not None
+        enough = (tolerance**2 / free[trial.problem] + 1e-13) * trial.cost + least[trial.problem]
+        # Steps that fall from one to the next by a ratio leave about the last times that ratio.
+        left = trial.promised * (trial.promised / trial.before).clamp_max(1)
+        small = (trial.step / rows.scale).abs().amax(-1) <= _ROUNDING
+        return (left <= enough) | small & (trial.damping <= _LIGHT)
+
+    found = descend(
+        evaluate,
+        step_of,
+        settled,
+        begin.flatten(0, 1),
+        damping=_FIRST_DAMPING,
+        max_iterations=max_iterations,
+        trusting=True,
+    )
+    shape = len(begin), starts
+    return found.value.reshape(begin.shape), found.cost.view(shape), found.converged.view(shape), found.evaluations
+
+
+def _seen_step(matrix: Tensor, gradient: Tensor, damping: Tensor, unseen: Tensor) -> tuple[Tensor, Tensor]:
+    """As `damped_step`, within the eigenvectors of the matrix whose eigenvalue is above `unseen`, `…`."""
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(matrix))
+    largest = values[..., -1:]
+    along = (vectors.mT @ gradient[..., None])[..., 0]
+    curvature = values + (damping[..., None] * largest).clamp_min(1e-100)
+    part = torch.where(values > torch.maximum(unseen[..., None], 1e-14 * largest), -along / curvature, 0.0)
+    step = (vectors @ part[..., None])[..., 0]
+    return step, (part * ((curvature - values) * part - along)).sum(-1) / 2
 
 
 def _message(converged: Tensor, cost: Tensor, max_iterations: int) -> str:

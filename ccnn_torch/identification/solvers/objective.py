@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification.problems.linear import WeightedRows
 from ccnn_torch.identification.problems.problem import Problem
-from ccnn_torch.numerics.least_squares import jacobian_of
 
 FORBIDDEN = 1e100
 """Cost of parameters with which a measured row cannot be reached; finite, so that searches may compare with it."""
@@ -24,33 +24,43 @@ WIDTH = 3.0
 _HELD = 1e-9
 
 
-@dataclass(frozen=True)
 class Objective:
-    """Half the weighted sum of squares and prior terms, in the coordinates u = (values - start) / scale.
+    """Half the weighted sum of squares and prior terms of a problem, in the coordinates u = (values - start) / scale.
 
-    Attributes:
-        problem: what is minimised.
-        data: as `Problem.data`, one each machine; rows of weight 0 hold the numbers of a row that counts, so that a
-            configuration that cannot be reached does not spoil the gradient through 0 · NaN.
-        stiffness: `k` [1]; scale / prior_sd, 0 where there is no prior.
+    Raises:
+        InputError: a machine without a row that counts, or whose start does not reach one.
     """
 
-    problem: Problem
-    data: tuple[Tensor, ...]
-    stiffness: Tensor
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.rows = WeightedRows(problem)
+        for empty in (~(problem.weights > 0).any(-1)).nonzero():
+            raise InputError(f"machine {int(empty)} has no row to identify from: all its weights are 0")
+        start = torch.zeros(self.machines, 1, len(problem.scale), dtype=torch.float64)
+        for lost in (self.cost(start)[:, 0] >= FORBIDDEN).nonzero():
+            raise InputError(
+                f"machine {int(lost)}: a measured row cannot be reached with the parameters that the search starts "
+                "from; leave the row out or correct it"
+            )
 
     @property
     def machines(self) -> int:
         """Number of machines, `r`."""
         return self.problem.start.shape[0]
 
-    def values(self, points: Tensor) -> Tensor:
-        """From coordinates to parameters: `r x … x k` [1] to the same [SI]."""
-        start = self.problem.start
-        start = start.reshape(len(start), *(1,) * (points.dim() - 2), -1)
-        return start + points * self.problem.scale
+    def of(self, machine: int) -> Objective:
+        """The objective of one machine alone."""
+        problem, one = self.problem, slice(machine, machine + 1)
+        data = tuple(d if len(d) == 1 else d[one] for d in problem.data)
+        return Objective(
+            dataclasses.replace(problem, start=problem.start[one], data=data, weights=problem.weights[one])
+        )
 
-    @torch.no_grad()
+    def values(self, points: Tensor, machines: Tensor | None = None) -> Tensor:
+        """From coordinates to parameters: `m x … x k` [1] of these machines to the same [SI]."""
+        start = self.problem.start if machines is None else self.problem.start[machines]
+        return start.reshape(len(start), *(1,) * (points.dim() - 2), -1) + points * self.problem.scale
+
     def cost(self, points: Tensor, machines: Tensor | None = None) -> Tensor:
         """Costs of a population.
 
@@ -62,65 +72,30 @@ class Objective:
             `m x p`; `FORBIDDEN` where a residual is not finite.
         """
         machines = torch.arange(self.machines) if machines is None else machines
-        rows = self.problem.weights.shape[-1] * max(len(machines), 1)
-        parts = torch.split(points, max(1, _ROWS_AT_ONCE // max(rows, 1)), dim=1)
-        return torch.cat([self._cost(part, machines) for part in parts], dim=1)
+        count = self.problem.weights.shape[-1] * max(len(machines), 1)
+        parts = torch.split(self.values(points, machines), max(1, _ROWS_AT_ONCE // max(count, 1)), dim=1)
+        return torch.cat([self.rows.cost(part, machines) for part in parts], dim=1).clamp_max(FORBIDDEN)
 
     def cost_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Cost `r` and its gradient `r x k` at `r x k` [1]; `FORBIDDEN` and 0 where a residual is not finite."""
-        with torch.enable_grad():
-            here = points.detach().clone().requires_grad_()
-            cost = self._cost(here[:, None], torch.arange(self.machines))[:, 0]
-            (gradient,) = torch.autograd.grad(cost.sum(), here)
+        cost, gradient, _ = self._normal(points)
         good = (cost < FORBIDDEN) & torch.isfinite(gradient).all(-1)
-        return torch.where(good, cost, FORBIDDEN).detach(), torch.where(good[:, None], gradient, 0.0)
+        return torch.where(good, cost, FORBIDDEN), torch.where(good[:, None], gradient, 0.0)
 
     def even_coordinates(self, points: Tensor) -> Tensor:
         """T with T Tᵀ the inverse of the Gauss-Newton Hessian at `r x k`; `r x k x k`.
 
         Directions that the rows hardly see are held by a share of 1e-9 of the largest curvature.
         """
-        problem = self.problem
-        count = problem.weights.shape[-1]
-        values = self.values(points)[:, None].expand(-1, count, -1)
-        slope = jacobian_of(lambda v: problem.residual(v, *self.data), values)[1] * problem.scale
-        slope = torch.nan_to_num(slope, posinf=0.0, neginf=0.0) * problem.weights.sqrt()[..., None, None]
-        flat = slope.flatten(1, 2)
-        hessian = flat.mT @ flat + torch.diag(self.stiffness.square())
+        hessian = torch.nan_to_num(self._normal(points)[2], posinf=0.0, neginf=0.0)
         held = _HELD * hessian.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-100)
-        unit = torch.eye(len(problem.scale), dtype=hessian.dtype)
+        unit = torch.eye(len(self.problem.scale), dtype=hessian.dtype)
         factor = torch.linalg.cholesky(hessian + held[:, None, None] * unit)
         turn: Tensor = torch.linalg.solve_triangular(factor.mT, unit.expand_as(factor), upper=True)
         return turn
 
-    def _cost(self, points: Tensor, machines: Tensor) -> Tensor:
-        values = self.problem.start[machines, None] + points * self.problem.scale
-        data = (d[machines, None] for d in self.data)
-        square = self.problem.residual(values[:, :, None], *data).square().sum(-1)
-        weights = self.problem.weights.expand(self.machines, -1)[machines, None]
-        total = (square * weights).sum(-1) / 2 + (points * self.stiffness).square().sum(-1) / 2
-        return torch.where(torch.isfinite(total), total, FORBIDDEN)
-
-
-def make_objective(problem: Problem) -> Objective:
-    """The objective of a problem."""
-    r = problem.start.shape[0]
-    weights = problem.weights.expand(r, -1)
-    counts = weights > 0
-    if not bool(counts.any(-1).all()):
-        machine = int((~counts.any(-1)).nonzero()[0])
-        raise InputError(f"machine {machine} has no row to identify from: all its weights are 0")
-    data = tuple(d.expand(r, *d.shape[1:]) for d in problem.data)
-    if not bool(counts.all()):
-        # Each row that does not count becomes the first that does.
-        place = torch.where(counts, torch.arange(weights.shape[-1]), counts.int().argmax(-1, keepdim=True))
-        data = tuple(d.gather(1, place[..., None].expand_as(d)) for d in data)
-    stiffness = problem.scale / problem.prior_sd
-    objective = Objective(problem, data, torch.where(torch.isfinite(problem.prior_sd), stiffness, 0.0))
-    lost = (objective.cost(torch.zeros(r, 1, len(problem.scale), dtype=torch.float64))[:, 0] >= FORBIDDEN).nonzero()
-    if len(lost):
-        raise InputError(
-            f"machine {int(lost[0])}: a measured row cannot be reached with the parameters that the search starts "
-            "from; leave the row out or correct it"
-        )
-    return objective
+    def _normal(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost `r`, gradient `r x k` and Gauss-Newton matrix `r x k x k`."""
+        found = self.rows.normal(self.values(points)[:, None], torch.arange(self.machines))
+        cost, gradient, matrix = (part[:, 0] for part in found)
+        return cost, gradient, matrix

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
+
+import torch
+from torch import Tensor
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.read import CONFIG_LIMIT, read_text
+from ccnn_torch.files.read import CONFIG_LIMIT, read_text, read_xml
 from ccnn_torch.files.yaml_file import parse_yaml
-from ccnn_torch.mechanisms.machines.serial import MOST_JOINTS, SerialArm
+from ccnn_torch.mechanisms.machines.serial import MOST_JOINTS, SerialArm, compose
+from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
 from ccnn_torch.units import LARGEST
 
 _CONVENTIONS = {
@@ -147,3 +154,173 @@ def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
         raise InputError(f"{where} must be a finite number, got {visible(repr(value))}")
     return float(value)
+
+
+# Bytes; with inertias and meshes named, a robot has some 100 kB.
+_LARGEST = 20_000_000
+
+_MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+
+
+def read_urdf(
+    path: str, base: str | None = None, tip: str | None = None, orientation: str = "rotation_vector"
+) -> SerialArm:
+    """Read the chain base → tip. Base and tool frame are unknown: measured data has its own.
+
+    A fixed joint before a moving one becomes part of its origin; those behind the last moving joint become the tool.
+
+    Args:
+        path: the file.
+        base: first link; the only link without a parent when None.
+        tip: last link; needed where the chain branches.
+        orientation: "rotation_vector", or "none" for records of positions only.
+
+    Raises:
+        InputError: one sentence that names the file and the joint or link: a branch without `tip`, an unknown link, a
+            mimic, floating or planar joint in the chain, a number that is none.
+    """
+    root = read_xml(path, _LARGEST, "give the path of a URDF")
+    chain = _chain(path, root, base, tip)
+    if len(chain) > 2 * MOST_JOINTS:
+        raise InputError(f"{path}: the chain has {len(chain)} joints; up to {MOST_JOINTS} that move can be handled")
+    links: list[list[float]] = []
+    axes: list[list[float]] = []
+    types: list[str] = []
+    limits: list[list[float]] = []
+    fixed = _IDENTITY
+    for joint in chain:
+        name, kind = joint.get("name", "?"), joint.get("type", "")
+        fixed = compose(fixed, _origin(path, joint))
+        if kind == "fixed":
+            continue
+        if kind not in _MOVING or joint.find("mimic") is not None:
+            what = "follows another joint (mimic)" if kind in _MOVING else f"is of type '{kind}'"
+            raise InputError(
+                f"{path}: joint '{name}' {what}; a chain has revolute, continuous, prismatic and fixed ones"
+            )
+        links.append(_link_row(fixed))
+        axes.append(_axis(path, joint))
+        types.append(_MOVING[kind])
+        limits.append(_limit(path, joint, kind))
+        fixed = _IDENTITY
+    if not links:
+        raise InputError(f"{path}: the chain has no joint that moves; give base=LINK and tip=LINK")
+    return SerialArm(
+        name=visible(root.get("name", Path(path).stem), 60),
+        convention="urdf",
+        links=links,
+        joint_types=types,
+        axes=axes,
+        tool=[*fixed[1].tolist(), *matrix_to_rotation_vector(fixed[0]).tolist()],
+        limits=limits,
+        unknown_frames=["base", "tool"],
+        orientation=orientation,
+    )
+
+
+_Transform = tuple[Tensor, Tensor]
+_IDENTITY: _Transform = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+
+def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[Element]:
+    """Joints from base to tip, found from the tip upwards."""
+    joints = root.findall("joint")
+    parent_joint = {_link(path, j, "child"): j for j in joints}
+    if len(parent_joint) < len(joints):
+        twice = Counter(_link(path, j, "child") for j in joints).most_common(1)[0][0]
+        raise InputError(f"{path}: link '{twice}' is the child of several joints; a chain has one")
+    parents = {_link(path, j, "parent") for j in joints}
+    known = [str(link.get("name")) for link in root.findall("link")]
+    for link in (base, tip):
+        if link is not None and link not in known:
+            raise InputError(f"{path}: has no link '{link}'; it has {', '.join(known)}")
+    if base is None:
+        _refuse_pieces(path, known, joints)
+    if tip is None:
+        tips = [link for link in known if link in parent_joint and link not in parents]
+        if len(tips) != 1:
+            raise InputError(
+                f"{path}: the chain branches; give the last link as tip=, one of {', '.join(tips) or 'none'}"
+            )
+        tip = tips[0]
+    chain: list[Element] = []
+    link = tip
+    while link != base and link in parent_joint and len(chain) <= len(joints):
+        chain.append(parent_joint[link])
+        link = _link(path, parent_joint[link], "parent")
+    if len(chain) > len(joints):
+        raise InputError(f"{path}: the joints above link '{tip}' form a loop; a chain begins at a link with no parent")
+    if base is not None and link != base:
+        raise InputError(f"{path}: link '{tip}' does not hang on link '{base}'; give another base= or tip=")
+    return chain[::-1]
+
+
+def _refuse_pieces(path: str, known: list[str], joints: list[Element]) -> None:
+    """Refuse links that hang in several trees with joints that move: the joint between them is missing."""
+    top = {_link(path, j, "child"): _link(path, j, "parent") for j in joints}
+    # Each time twice as far up; one link at a time takes a minute for a hostile file.
+    for _ in range(len(joints).bit_length()):
+        top = {link: top.get(above, above) for link, above in top.items()}
+    roots = {top.get(link, link) for link in (_link(path, j, "parent") for j in joints if j.get("type") in _MOVING)}
+    pieces = [link for link in known if link in roots]
+    if len(pieces) > 1:
+        raise InputError(
+            f"{path}: no joint leads to link '{pieces[1]}', so that the chain is in {len(pieces)} pieces: a joint is "
+            f"missing; add it, or give base={pieces[1]} where the piece from there is meant"
+        )
+
+
+def _link(path: str, joint: Element, role: str) -> str:
+    element = joint.find(role)
+    name = None if element is None else element.get("link")
+    if name is None:
+        raise InputError(f"{path}: joint '{joint.get('name', '?')}' lacks <{role} link=…>")
+    return name
+
+
+def _triple(path: str, joint: Element, tag: str, attribute: str, default: str) -> Tensor:
+    element = joint.find(tag)
+    text = default if element is None else element.get(attribute, default)
+    try:
+        values = [float(v) for v in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(abs(v) <= LARGEST for v in values):
+        raise InputError(
+            f"{path}: joint '{joint.get('name', '?')}' needs three numbers in {tag} {attribute}, got '{text}'"
+        )
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _origin(path: str, joint: Element) -> _Transform:
+    roll_pitch_yaw = _triple(path, joint, "origin", "rpy", "0 0 0")
+    return euler_zyx_to_matrix(roll_pitch_yaw.flip(-1)), _triple(path, joint, "origin", "xyz", "0 0 0")
+
+
+def _axis(path: str, joint: Element) -> list[float]:
+    axis = _triple(path, joint, "axis", "xyz", "1 0 0")
+    if axis.norm() == 0:
+        raise InputError(f"{path}: joint '{joint.get('name', '?')}' has the axis 0 0 0; give its direction")
+    values: list[float] = (axis / axis.norm()).tolist()
+    return values
+
+
+def _limit(path: str, joint: Element, kind: str) -> list[float]:
+    """Travel for sampling; a full turn where the file states none, since limits do not matter to a calibration."""
+    element = joint.find("limit")
+    default = (0.0, 1.0) if kind == "prismatic" else (-math.pi, math.pi)
+    if element is None or kind == "continuous":
+        return list(default)
+    try:
+        low, high = (float(element.get(k, d)) for k, d in zip(("lower", "upper"), default, strict=True))
+    except ValueError:
+        low = high = math.nan
+    if not -LARGEST <= low <= high <= LARGEST:
+        name = joint.get("name", "?")
+        raise InputError(f"{path}: joint '{name}' has limits that are no numbers, or the upper one below the lower one")
+    return [low, high]
+
+
+def _link_row(transform: _Transform) -> list[float]:
+    """x, y, z, roll, pitch, yaw."""
+    return [*transform[1].tolist(), *matrix_to_euler_zyx(transform[0]).flip(-1).tolist()]

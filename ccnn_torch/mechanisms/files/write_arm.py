@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -11,9 +13,11 @@ from torch import Tensor
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import write_whole
 from ccnn_torch.files.yaml_file import dump_yaml
-from ccnn_torch.mechanisms.machines.link_frames import compose
-from ccnn_torch.mechanisms.machines.serial import SerialArm
+from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text
+from ccnn_torch.mechanisms.machines.serial import SerialArm, compose
+from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
 
 _CONVENTIONS = {
@@ -134,3 +138,31 @@ def _joint(root: Element, name: str, kind: str, parent: str, child: str, origin:
 
 def _numbers(values: Tensor) -> str:
     return " ".join(repr(v) for v in values.tolist())
+
+
+def write_machine(
+    mechanism: Mechanism,
+    nominal: Mapping[str, float],
+    folder: Path,
+    stem: str,
+    columns: Mapping[str, str] | None = None,
+    joint_map: Mapping[str, str] | None = None,
+) -> list[Path]:
+    """Write `STEM.yaml`, of a serial arm also `STEM.urdf` and, where it is one of DH parameters, `STEM_dh.yaml`.
+
+    Args:
+        mechanism: with the values found.
+        nominal: what was there before, by name [SI].
+        folder: where to.
+        stem: of the files' names.
+        columns: the headers that its records mapped.
+        joint_map: the joints as sums of its records' columns.
+    """
+    texts = {f"{stem}.yaml": mechanism_text(mechanism, nominal, columns, joint_map)}
+    if isinstance(mechanism, SerialArm):
+        texts[f"{stem}.urdf"] = urdf_text(mechanism)
+        if mechanism.convention != "urdf":
+            texts[f"{stem}_dh.yaml"] = dh_text(mechanism)
+    for name, text in texts.items():
+        write_whole(folder / name, text)
+    return [folder / name for name in texts]

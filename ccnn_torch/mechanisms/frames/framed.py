@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.frames.closed_form_start import best_closed_form, rigid_body_frame
-from ccnn_torch.mechanisms.machines.link_frames import compose
+from ccnn_torch.mechanisms.frames.fit import best_closed_form, rigid_body_frame
+from ccnn_torch.mechanisms.machines.serial import compose
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative
 from ccnn_torch.mechanisms.pose import Frame, frame_gap

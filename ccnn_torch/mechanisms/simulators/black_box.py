@@ -15,9 +15,7 @@ from ccnn_torch.mechanisms.finite_differences import central_slope, differentiab
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative
 from ccnn_torch.mechanisms.pose import Frame, frame_from_coordinates, frame_gap
-from ccnn_torch.mechanisms.simulators.calls import Calls, described
-from ccnn_torch.mechanisms.simulators.simulator import Simulator
-from ccnn_torch.mechanisms.simulators.trial import try_simulator
+from ccnn_torch.mechanisms.simulators.simulator import Calls, Simulator, described, try_simulator
 from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ccnn_torch.effects.parameter import PARAMETER
+from ccnn_torch.effects.constant import PARAMETER
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
 OWN = "own "

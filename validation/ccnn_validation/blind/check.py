@@ -18,8 +18,7 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_torch.report.screen import note, say_place, stdout
-from ccnn_torch.run_folder.folder import kept_for
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import kept_for, locked
 from ccnn_validation.blind.folder import BlindFolder
 from ccnn_validation.blind.machines import MACHINES
 from ccnn_validation.blind.plan import KINDS, plan_cases

@@ -25,8 +25,7 @@ from ccnn_torch.records import load_records, write_table
 from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.report.table import print_table
-from ccnn_torch.run_folder.folder import kept_for
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import kept_for, locked
 from ccnn_validation.sources.case import Source, SourceCase
 from ccnn_validation.sources.judge import judged
 from ccnn_validation.sources.report import source_tables, write_source

@@ -1,0 +1,286 @@
+"""Commands that make something of measured records: new, run, identify, diagnose, check."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+from ccnn_torch.cli.options import (
+    Config,
+    ConfigOption,
+    Effects,
+    Mechanism,
+    Noise,
+    Out,
+    Overrides,
+    Quiet,
+    Records,
+    Resume,
+    Seed,
+    Words,
+    config_and_changes,
+    loading,
+    noted,
+)
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import read_yaml
+from ccnn_torch.run_folder.folder import NOTHING_WRITTEN, if_stopped
+
+if TYPE_CHECKING:
+    from ccnn_torch.config.tree import JobConfig
+    from ccnn_torch.diagnosis.config import DiagnoseConfig
+
+
+def new(
+    records: Annotated[Path, typer.Argument(metavar="RECORDS.csv", help="Measured rows, with a line of headers.")],
+    out: Annotated[Path, typer.Option(metavar="CONFIG.yaml", help="The config to write.")],
+    mechanism: Mechanism = None,
+    units: Annotated[
+        str | None, typer.Option(metavar="LENGTH,ANGLE", help="Units of columns without one, e.g. mm,deg.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing CONFIG.yaml.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a config for ccnn run from a table of measurements, with comments on what was guessed.
+
+    Joints may be called q1, J1, A1, joint_1, axis1 …; the position X, Y, Z; the orientation rx, ry, rz, qw to qz, A, B,
+    C (KUKA) or W, P, R (Fanuc). What cannot be guessed is asked for on a terminal; elsewhere, and with
+    --quiet, a message names it.
+
+    Examples:
+
+    ccnn new measured.csv --out robot.yaml
+
+    ccnn new measured.csv --mechanism my_arm.yaml --units mm,deg --out robot.yaml
+    """
+    if out.exists() and not force:
+        raise InputError(f"{out} is there already; name another file, or give --force to overwrite it")
+    from ccnn_torch.files.write import write_whole
+    from ccnn_torch.starter.job import starter_config
+
+    asks = not quiet and sys.stdin is not None and sys.stdin.isatty()
+    ask = (lambda question: str(typer.prompt(question, default="", show_default=False))) if asks else None
+    text, ready = starter_config(records, out, mechanism, units, ask)
+    write_whole(out, text.encode())
+    if quiet:
+        return
+    typer.echo(f"{out} is written. Check it, then:")
+    typer.echo(f"ccnn run {out}" if ready else f"ccnn run {out} mechanism=FILL_IN")
+
+
+def run(
+    config: Config = None,
+    overrides: Overrides = None,
+    config_option: ConfigOption = None,
+    records: Records = None,
+    mechanism: Mechanism = None,
+    resume: Resume = None,
+    out: Out = None,
+    seed: Seed = None,
+    quiet: Quiet = False,
+) -> None:
+    """Train on a case study or on measured records; write tables, curves, plots and model files into a run folder.
+
+    On records cross-validation chooses first what the model holds: identified geometry, effects that a diagnosis of
+    the training rows names, a learner (keys geometry and effects).
+
+    Examples:
+
+    ccnn run experiments/tripod.yaml
+
+    ccnn run experiments/tripod.yaml repeats=30 out=runs/tripod30
+
+    ccnn run experiments/machine_tool.yaml variant=tabulated ccnn.generations=240
+
+    ccnn run experiments/records.yaml records=my_robot.csv mechanism=my_robot.yaml
+
+    ccnn run records=my_robot.csv mechanism=my_robot.yaml effects=from:runs/diagnosis/diagnosis.json
+
+    ccnn run --resume runs/tripod30
+    """
+    words = [config, *(overrides or [])]
+    file, changes = config_and_changes(words, config_option, records=records, mechanism=mechanism, out=out, seed=seed)
+    if file is not None:
+        # Before torch is loaded: a file that is not there need not wait for it.
+        read_yaml(file)
+    from ccnn_torch.calibration.config import RunConfig
+    from ccnn_torch.calibration.job import resume_run, start_run
+
+    _start_or_resume("run experiments/tripod.yaml", RunConfig, start_run, resume_run, file, changes, resume, quiet)
+
+
+def identify(
+    config: Config = None,
+    overrides: Overrides = None,
+    config_option: ConfigOption = None,
+    records: Records = None,
+    mechanism: Mechanism = None,
+    resume: Resume = None,
+    out: Out = None,
+    seed: Seed = None,
+    keys: Annotated[bool, typer.Option("--keys", help="List every key with its default, and exit.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Identify a machine's geometry: parameters with intervals, unidentifiable parameters, held-out pose error.
+
+    The folder gets identified.json, .csv, .md, plots and report.html, and the machine itself: identified.yaml, which
+    every command takes as a mechanism and ccnn compensate as a model; of a serial arm also identified.urdf and
+    identified_dh.yaml for other tools.
+
+    Examples:
+
+    ccnn identify experiments/five_bar.yaml
+
+    ccnn identify experiments/overconstrained_2dof.yaml methods=[lm,tikhonov] simulate.machines=20
+
+    ccnn identify mechanism=ur10.yaml records=measured.csv out=runs/arm
+
+    ccnn identify experiments/sockets.yaml      without a measuring device: a ball in sockets
+
+    ccnn identify --resume runs/arm
+
+    ccnn compensate runs/arm/identified.yaml poses.csv commands.csv --pose
+    """
+    from ccnn_torch.identification.config import IdentifyConfig
+    from ccnn_torch.identification.job import resume_identification, start_identification
+
+    if keys:
+        from ccnn_torch.config.keys import list_keys
+
+        for key, default, description in list_keys(IdentifyConfig):
+            typer.echo(f"{key}={default}\n    {description}")
+        return
+    words = [config, *(overrides or [])]
+    file, changes = config_and_changes(words, config_option, records=records, mechanism=mechanism, out=out, seed=seed)
+    start, again = start_identification, resume_identification
+    _start_or_resume("identify experiments/five_bar.yaml", IdentifyConfig, start, again, file, changes, resume, quiet)
+
+
+_AnyConfig = TypeVar("_AnyConfig", bound="JobConfig")
+
+
+def _start_or_resume(
+    example: str,
+    model: type[_AnyConfig],
+    start: Callable[[_AnyConfig, bool], object],
+    again: Callable[[Path, bool], object],
+    file: Path | None,
+    changes: list[str],
+    resume: Path | None,
+    quiet: bool,
+) -> None:
+    if resume is not None:
+        if changes or file is not None:
+            raise InputError("--resume takes the folder alone, without CONFIG, overrides and other options")
+        again(resume, quiet)
+        return
+    if file is None and not changes:
+        raise InputError(f"name a config, for example: ccnn {example} (or --resume DIR)")
+    start(model.from_file(file, changes, noted(quiet)), quiet)
+
+
+def diagnose(
+    overrides: Words = None,
+    records: Records = None,
+    mechanism: Mechanism = None,
+    motion: Annotated[
+        list[Path] | None,
+        typer.Option(help="CSV of time, commands and positions of a machine in motion; a run, may be repeated."),
+    ] = None,
+    out: Out = None,
+    noise: Noise = None,
+    effects: Effects = None,
+    config: ConfigOption = None,
+    seed: Seed = None,
+    network: Annotated[
+        bool | None, typer.Option(help="Estimate the further gain by a network; the same as network=….")
+    ] = None,
+    details: Annotated[bool, typer.Option("--details", help="Show all tables as well.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find the physical effect that explains the error of a model, and how much of the error it removes.
+
+    The diagnosis comes first; then a network is trained on the residual of the effects, to estimate its further gain
+    (seconds; --no-network omits that). The folder gets diagnosis.json, report.html and next_measurements.csv, the most
+    informative poses to measure next. With --motion it is of time series: delay, gains, friction, play,
+    weights, limits. Keys: records, motion, columns, mechanism, out, mechanism_keys, covariates, noise,
+    effects, gravity, network, seed.
+
+    Examples:
+
+    ccnn diagnose --records measured.csv --mechanism five_bar --out runs/diagnosis
+
+    ccnn diagnose --records measured.csv --mechanism arm.yaml --out runs/arm --noise x=1e-5,y=1e-5,z=2e-5
+
+    ccnn diagnose --records measured.csv --mechanism stewart --out runs/s --effects all,my_effect.py:Mine
+
+    ccnn diagnose --records measured.csv --mechanism my_simulator.py:PRESS --out runs/press
+
+    ccnn diagnose --motion sine.csv --motion steps.csv --mechanism servo --out runs/axis
+    """
+    with loading():
+        from ccnn_torch.diagnosis.job import run_diagnosis
+        from ccnn_torch.motion.job import run_motion
+
+    logs = [str(log) for log in motion or []] or None
+    given = {"records": records, "mechanism": mechanism, "seed": seed, "out": out, "network": network, "motion": logs}
+    wanted = _diagnose_config(overrides, config, noise, effects, quiet, **given)
+    (run_motion if wanted.motion else run_diagnosis)(wanted, quiet, details)
+
+
+def check(
+    overrides: Words = None,
+    records: Records = None,
+    mechanism: Mechanism = None,
+    out: Out = None,
+    noise: Noise = None,
+    effects: Effects = None,
+    config: ConfigOption = None,
+    seed: Seed = None,
+    quiet: Quiet = False,
+) -> None:
+    """Report which effects records can identify: rows, noise, covariates, unidentifiable effects, confusable pairs.
+
+    With --out the folder gets check.json.
+
+    Examples:
+
+    ccnn check --records measured.csv --mechanism five_bar
+
+    ccnn check --records measured.csv --mechanism my_simulator.py:PRESS
+    """
+    with loading():
+        from ccnn_torch.diagnosis.job import run_check
+        from ccnn_torch.diagnosis.outputs import write_check
+        from ccnn_torch.diagnosis.page.check import check_table, check_text
+        from ccnn_torch.report.screen import say, stdout, with_status
+        from ccnn_torch.report.table import print_table
+
+    with if_stopped(NOTHING_WRITTEN):
+        given = {"records": records, "mechanism": mechanism, "seed": seed, "out": out}
+        wanted = _diagnose_config(overrides, config, noise, effects, quiet, **given)
+        found = with_status("checking what the rows can identify …", lambda _: run_check(wanted), quiet)
+    if not quiet:
+        for line in check_text(found):
+            say(line)
+        if found.confusable:
+            print_table(check_table(found), stdout)
+    if wanted.out is not None:
+        write_check(Path(wanted.out), found)
+
+
+def _diagnose_config(
+    words: list[str] | None, config: Path | None, noise: str | None, effects: str | None, quiet: bool, **given: object
+) -> DiagnoseConfig:
+    """The config, under the options of the command line; `words` may begin with the config."""
+    from ccnn_torch.config.sizes import read_noise
+    from ccnn_torch.diagnosis.config import DiagnoseConfig
+
+    names = None if effects is None else [e.strip() for e in effects.split(",") if e.strip()]
+    sizes = None if noise is None else read_noise(noise)
+    file, changes = config_and_changes(words or [], config, **given, noise=sizes, effects=names)
+    return DiagnoseConfig.from_file(file, changes, noted(quiet))

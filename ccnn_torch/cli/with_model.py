@@ -1,0 +1,303 @@
+"""Commands on the file of a model: compensate, export, verify, sign; and on a run folder: picture."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ccnn_torch.cli.options import (
+    AllowCode,
+    ConfigOption,
+    Mechanism,
+    OutFolder,
+    PublicKey,
+    Quiet,
+    Records,
+    config_and_changes,
+    noted,
+)
+from ccnn_torch.errors import InputError
+from ccnn_torch.run_folder.folder import NOTHING_WRITTEN, if_stopped
+
+_FRAME = "X,Y,Z,RX,RY,RZ"
+
+
+def compensate(
+    model: Annotated[
+        Path, typer.Argument(help=".safetensors, .onnx, identified.yaml, diagnosis.json or identified_motion.json.")
+    ],
+    input: Annotated[Path, typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit].")],
+    output: Annotated[Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands.")],
+    pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
+    back: Annotated[bool, typer.Option("--back", help="IN has commands; OUT gets the ideal joints.")] = False,
+    sd: Annotated[bool, typer.Option("--sd", help="OUT gets the deviations' standard deviations, too.")] = False,
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            metavar=_FRAME,
+            help="With --pose, of an arm: another tool than the measured one, from the end of the last link.",
+        ),
+    ] = None,
+    base: Annotated[
+        str | None,
+        typer.Option(
+            metavar=_FRAME, help="With --pose, of an arm: the frame that poses are given in, in the measured one."
+        ),
+    ] = None,
+    public_key: PublicKey = None,
+    allow_code: AllowCode = False,
+    quiet: Quiet = False,
+) -> None:
+    """Correct joints so that the machine reaches the intended pose; or, with --back, convert commands to ideal joints.
+
+    Headers that the model's run mapped by `columns` are mapped again.
+
+    OUT.csv repeats the columns of IN.csv and adds command_q1[unit]…, deviation_q1[unit]…, inside_domain[1] and
+    status[1]: 0 exact, 1 outside what was measured or fallen back, 2 input not finite, 3 damped near a singular pose,
+    at a limit or not settled (the nearest safe command). With --back it adds ideal_q1[unit]… and inside_domain[1];
+    the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
+    serial arm takes the branch of guess_q1[unit]… where given, else that of the previous row. With --sd it also adds
+    deviation_sd_q1[unit]…: inside the domain, about 95 % of new measurements are within 1.96 times it of the predicted
+    deviation. With identified.yaml, which ccnn identify writes, the commands are those of the identified kinematics,
+    with diagnosis.json, which ccnn diagnose writes, those of the machine with the effects that it names.
+
+    With identified_motion.json, which ccnn diagnose --motion writes, IN.csv has time[s] and command1[unit]…, the
+    motion that is wanted, and OUT.csv gets corrected1[unit]…, the commands at which the machine follows it, and
+    predicted1[unit]…, where it then goes.
+
+    Every row is checked against the model's card. Where the model violates it (a number that is not finite, a
+    deviation above most_deviation), the row has command = joints and inside_domain = 0, and the exit code is 2.
+
+    Examples:
+
+    ccnn compensate checkpoints/tripod/model.onnx joints.csv commands.csv
+
+    ccnn compensate runs/ur10/model.safetensors poses.csv commands.csv --pose
+
+    ccnn compensate runs/ur10/model.safetensors poses.csv out.csv --pose --tool "10mm,0,120mm,0,90deg,0"
+
+    ccnn compensate checkpoints/tripod/model.onnx commands.csv ideal.csv --back
+
+    ccnn compensate checkpoints/tripod/model.onnx joints.csv commands.csv --sd
+
+    ccnn compensate runs/five_bar/identified.yaml poses.csv commands.csv --pose
+
+    ccnn compensate runs/axis/identified_motion.json motion.csv commands.csv
+
+    ccnn compensate from_a_stranger/model.onnx joints.csv commands.csv --public-key theirs.public.pem
+    """
+    if pose and back:
+        raise InputError("--pose and --back exclude each other: --pose takes wanted poses, --back takes commands")
+    if sd and back:
+        raise InputError(
+            "--sd and --back exclude each other: --sd gives the standard deviation of a command, --back takes commands"
+        )
+    for option, frame in (("--tool", tool), ("--base", base)):
+        if frame is not None and not pose:
+            raise InputError(f"{option}: needs --pose; joints are the same with every tool and in every frame")
+    for file, what in ((input, "IN.csv"), (model, "the model")):
+        if os.path.realpath(output) == os.path.realpath(file):
+            raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
+    with if_stopped(NOTHING_WRITTEN):
+        from ccnn_torch.compensation.job import compensate_table, is_of_motion
+
+        refused = ""
+        if is_of_motion(model):
+            from ccnn_torch.motion.compensate import compensate_motion
+
+            if pose or back or sd or public_key:
+                raise InputError(f"{model}: a model of a motion takes none of --pose, --back, --sd and --public-key")
+            said = [f"{sentence}." for sentence in compensate_motion(model, input, output, allow_code)]
+        else:
+            frames = [
+                None if text is None else _numbers(text, f"--{o}") for o, text in (("tool", tool), ("base", base))
+            ]
+            said, refused = compensate_table(model, input, output, pose, back, sd, public_key, allow_code, *frames)
+    if not quiet:
+        from ccnn_torch.report.screen import say
+
+        for sentence in said:
+            say(sentence)
+    if refused:
+        raise InputError(refused)
+
+
+def _numbers(text: str, option: str) -> list[float]:
+    """x, y, z and a rotation vector [m, rad]."""
+    from ccnn_torch.config.sizes import size
+
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) != 6:
+        raise InputError(f'{option} {text}: give x,y,z,rx,ry,rz with units, e.g. "10mm,0,120mm,0,90deg,0"')
+    found = [size(part, unit, option) for part, unit in zip(parts, ("m", "m", "m", "rad", "rad", "rad"), strict=True)]
+    if not all(map(math.isfinite, found)):
+        raise InputError(f"{option} {text}: has a number that is not finite; write lengths and angles")
+    return found
+
+
+def export(
+    model: Annotated[
+        Path, typer.Argument(help="A .safetensors file with its card, an identified.yaml or diagnosis.json.")
+    ],
+    to: Annotated[str, typer.Option(help="c99, st (IEC 61131-3 Structured Text), linuxcnc, onnx, urdf or table.")],
+    out: OutFolder,
+    dtype: Annotated[str, typer.Option(help="float64 or float32, in which the controller computes.")] = "float64",
+    sd: Annotated[bool, typer.Option("--sd", help="Add a function for the deviation's standard deviation.")] = False,
+    public_key: PublicKey = None,
+    allow_code: AllowCode = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a model for a controller: both directions, with domain, limit and fallback inside; or for a simulator.
+
+    c99 writes compensator.h, compensator.c, selftest.c and a Makefile: make test builds them without warnings and
+    compares more than a thousand golden vectors. The code has no heap, no recursion and no global state, and does
+    the same operations in each call. st writes compensator.st, selftest.st and a README.md for TwinCAT and CODESYS.
+    linuxcnc writes ccnnkins.comp, the machine's kinematics with the compensation around them, for halcompile; of an
+    identified.yaml the kinematics with the identified parameters. onnx writes model.onnx with master and card, and
+    controller.onnx with the command alone. urdf writes an arm with its identified links as URDF, MuJoCo model and DH
+    table. table writes the deviation over a grid, tables of single axes and a mesh where they suffice, and how far off
+    each of them is.
+
+    Source code returns the same codes: 0 exact; 1 outside the domain, or where the model broke its limit; 2 where an
+    input is not finite: then command = joints, with the middle of the domain for what is no number and its edge for
+    infinity; 3 damped near a singular pose, at a limit or not settled. Before a file is written its operations are
+    compared with the model: in float64 to 1e-12 of the limit (1e-9 with a Gaussian process, an identified machine or
+    physical effects), in float32 to 1e-5.
+
+    Examples:
+
+    ccnn export checkpoints/tripod/model.safetensors --to c99 --out controller && make -C controller test
+
+    ccnn export runs/ur10/model.safetensors --to st --out plc
+
+    ccnn export checkpoints/tripod/model.safetensors --to c99 --dtype float32 --sd --out microcontroller
+
+    ccnn export checkpoints/tripod/model.safetensors --to linuxcnc --out kins
+
+    ccnn export runs/arm/identified.yaml --to urdf --out robot
+    """
+    with if_stopped(NOTHING_WRITTEN):
+        from ccnn_torch.compensation import export_model
+
+        files = export_model(model, to, out, dtype, sd, public_key, allow_code)
+    if not quiet:
+        proven = "; their operations give the model's numbers" if to in ("c99", "st", "linuxcnc", "onnx") else ""
+        typer.echo(f"{out}: {', '.join(files)} written{proven}.")
+        if to == "c99":
+            typer.echo(f"Compile them and compare golden vectors: make -C {out} test")
+
+
+def verify(
+    model: Annotated[Path, typer.Argument(help="A .safetensors or .onnx file, an identified.yaml or diagnosis.json.")],
+    out: OutFolder,
+    records: Annotated[
+        str | None, typer.Argument(metavar="RECORDS.csv", help="New rows: joints and measured poses.")
+    ] = None,
+    records_option: Records = None,
+    config: ConfigOption = None,
+    mechanism: Mechanism = None,
+    compensated: Annotated[
+        bool, typer.Option("--compensated", help="The model was in use while the rows were measured.")
+    ] = False,
+    refit_frames: Annotated[
+        bool, typer.Option("--refit-frames", help="The measuring device was moved since the model was made.")
+    ] = False,
+    public_key: PublicKey = None,
+    allow_code: AllowCode = False,
+    quiet: Quiet = False,
+) -> None:
+    """Test a model on new measurements, against the error promised by its held-out rows.
+
+    The machine is the model's where --mechanism names no other.
+
+    Without --compensated the rows are of the uncompensated machine: joints commanded, pose measured. With --compensated
+    the joints are the ideal ones, the machine was commanded by the model, and the pose should be the nominal one.
+
+    Exit code 0: the promise is kept; 1: the RMS of position or rotation is above its limit at 95 %; 2: bad input.
+
+    Examples:
+
+    ccnn verify runs/ur10/model.safetensors next_week.csv --out runs/next_week
+
+    ccnn verify runs/ur10/model.safetensors with_it_on.csv --compensated --out runs/acceptance
+
+    ccnn verify runs/five_bar/identified.yaml other_day.csv --refit-frames --out runs/other_day
+    """
+    with if_stopped(NOTHING_WRITTEN):
+        from ccnn_torch.compensation import load_compensation
+        from ccnn_torch.verification.config import VerifyConfig
+        from ccnn_torch.verification.job import verify_model
+        from ccnn_torch.verification.page import write_verify_report
+
+        file, changes = config_and_changes([], config, records=records or records_option, mechanism=mechanism)
+        wanted = VerifyConfig.from_file(file, changes, noted(quiet))
+        if wanted.records is None:
+            raise InputError("records: are missing; give RECORDS.csv, --records, or the key in a config")
+        loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
+        read = {"columns": wanted.columns, "joint_map": wanted.joint_map, "mechanism_keys": wanted.mechanism_keys}
+        found = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, allow_code, **read)
+        write_verify_report(out, found.results, found.arrays)
+    results = found.results
+    if not quiet:
+        typer.echo(results.text)
+        for note in results.notes:
+            typer.echo(note)
+        typer.echo(f"Everything is in {out}; open {out / 'verify.html'}")
+    if not results.kept:
+        raise typer.Exit(1)
+
+
+def sign(
+    model: Annotated[Path | None, typer.Argument(help="A .safetensors or .onnx file, or identified.yaml.")] = None,
+    key: Annotated[Path | None, typer.Option("--key", metavar="PRIVATE.pem", help="Private Ed25519 key.")] = None,
+    new_key: Annotated[str | None, typer.Option("--new-key", metavar="NAME", help="Make a pair of keys.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Sign a model and its card with Ed25519: by MODEL.sig and the public key others verify that neither was changed.
+
+    With --new-key it writes NAME.private.pem, which you keep secret, and NAME.public.pem, which you give to the users
+    of your models; they run ccnn compensate MODEL … --public-key NAME.public.pem. A signature covers one file and its
+    card: sign again whenever the model is rewritten. It needs pip install 'ccnn-torch[sign]'.
+
+    Examples:
+
+    ccnn sign --new-key our_robots
+
+    ccnn sign runs/ur10/model.onnx --key our_robots.private.pem
+    """
+    if (model is None) == (new_key is None) or (model is None) != (key is None):
+        raise InputError("ccnn sign takes either MODEL and --key PRIVATE.pem, or --new-key NAME alone")
+    from ccnn_torch.compensation import new_key_pair, sign_model
+
+    if new_key is not None:
+        private, public = new_key_pair(new_key)
+        message = f"{private}: keep it secret. {public}: give it to the users of your models."
+    else:
+        assert model is not None and key is not None
+        message = f"{sign_model(model, key)}: written; pass it on with {model.name} and its card."
+    if not quiet:
+        typer.echo(message)
+
+
+def picture(
+    run_dir: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
+    out: Annotated[Path, typer.Argument(help="Where to write; a .png and a .svg are made.")],
+    joint: Annotated[str | None, typer.Option(help="Joint to show; by default the one with the largest error.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Draw a joint's error and the pose error over the workspace, before and after compensation.
+
+    Example:
+
+    ccnn picture runs/tripod docs/picture.png --joint q3
+    """
+    from ccnn_torch.calibration.page.report import make_picture
+    from ccnn_torch.report.screen import say
+
+    caption = make_picture(run_dir, out, joint)
+    if not quiet:
+        say(caption)

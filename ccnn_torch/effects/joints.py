@@ -1,0 +1,217 @@
+"""Effects on each joint alone or on another one: offset, gain, coupling, periodic errors of the drives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import Parameter, plausible_error
+from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
+from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.situation import Situation
+from ccnn_torch.mechanisms import Mechanism
+
+
+class JointOffset:
+    """Δq_i = c_i."""
+
+    name = "joint_offset"
+    kind: Kind = "joints"
+    description = "a constant error of each joint, as of a reference switch or an encoder's zero"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Nothing is needed."""
+        return ""
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """One a joint."""
+        return tuple(
+            Coefficient(j.name, j.unit, plausible_error(Parameter(j.name, j.unit, 0.0)), joint=j.name)
+            for j in situation.mechanism.joints
+        )
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """None."""
+        return ()
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """The identity at every row, `... x s x n x n`."""
+        n = situation.joints.shape[-1]
+        eye = torch.eye(n, dtype=situation.joints.dtype, device=situation.joints.device)
+        return eye.expand(*situation.joints.shape[:-1], n, n)
+
+
+_GAIN = 1e-3
+ZERO = {"m": 3e-4, "rad": 1e-3}
+"""What a gain makes between the middle of a joint's workspace and where the joint counts from [joint's unit]."""
+
+
+class JointGain:
+    """Δq_i = c_i (q_i - middle of its workspace) + z_i; z (secondary): it may be 0 elsewhere than in the middle."""
+
+    name = "joint_gain"
+    kind: Kind = "joints"
+    description = "joints that move by a constant share too far or too short, as by a screw's lead or a gear ratio"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Nothing is needed."""
+        return ""
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """Gain and zero of each joint."""
+        return tuple(
+            one
+            for j in situation.mechanism.joints
+            for one in (
+                Coefficient(j.name, "1", _GAIN, joint=j.name),
+                Coefficient(f"{j.name} zero", j.unit, ZERO[j.unit], joint=j.name, secondary=True),
+            )
+        )
+
+    def counted_from(self, situation: Situation) -> dict[str, int]:
+        """Coefficients that multiply a joint's command less the middle of its workspace, and the number of that joint.
+
+        A command of that middle has the joint where the zero says.
+        """
+        return {joint.name: i for i, joint in enumerate(situation.mechanism.joints)}
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """None."""
+        return ()
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x 2n`."""
+        return by_joint(torch.stack([situation.from_middle, torch.ones_like(situation.joints)], -1))
+
+
+class Coupling:
+    """Δq_i = Σ c_ij (q_j - middle of its workspace) + z_i over j ≠ i; z (secondary): it may be 0 elsewhere."""
+
+    name = "coupling"
+    kind: Kind = "joints"
+    description = "one joint's motion that moves another, as in a wrist's gears or a belt over several axes"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """A second joint."""
+        return "" if len(mechanism.joints) > 1 else "a second joint: a single one has nothing to be coupled to"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """One for each ordered pair of joints; a length per angle is 0.1 m a radian as likely as a share."""
+        joints = situation.mechanism.joints
+        size = {"m/rad": 1e-4, "rad/m": 1e-2}
+        pairs = [(i, j) for i in joints for j in joints if i.name != j.name]
+        units = ["1" if i.unit == j.unit else f"{i.unit}/{j.unit}" for i, j in pairs]
+        found = [
+            Coefficient(f"{i.name} by {j.name}", unit, size.get(unit, 1e-3), joint=i.name)
+            for (i, j), unit in zip(pairs, units, strict=True)
+        ]
+        found += [Coefficient(f"{j.name} zero", j.unit, ZERO[j.unit], joint=j.name, secondary=True) for j in joints]
+        return tuple(found)
+
+    def counted_from(self, situation: Situation) -> dict[str, int]:
+        """As of `JointGain`: the joint that moves the other one."""
+        joints = situation.mechanism.joints
+        return {f"{i.name} by {j.name}": k for i in joints for k, j in enumerate(joints) if i.name != j.name}
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """None."""
+        return ()
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x n²`."""
+        n = situation.joints.shape[-1]
+        others = torch.nonzero(~torch.eye(n, dtype=torch.bool).flatten()).squeeze(-1)
+        eye = torch.eye(n, dtype=situation.joints.dtype, device=situation.joints.device)
+        # moved joint, pair (i, j): 1 where the moved joint is i, times the position of joint j.
+        moved = eye[:, :, None] * situation.from_middle[..., None, None, :]
+        return torch.cat([moved.flatten(-2)[..., others], eye.expand(*moved.shape[:-2], n)], -1)
+
+
+_PERIODIC = {"m": 5e-5, "rad": 1e-4}
+# Waves: harmonics of the period, and how large they are likely to be.
+_HARMONICS = tuple(
+    (f"{wave}{'' if k == 1 else f' {k}'}", size)
+    for k, size in ((1, 1.0), (2, 0.5), (3, 0.02), (4, 0.02))
+    for wave in ("sin", "cos")
+)
+# Harmonics of a turn; those of a harmonic drive's ball cage and teeth lie near the hundredth.
+_MOST_PER_TURN = 130
+# Periods over the travel of a sliding joint; fewer than the first are indistinguishable from a bend.
+_PERIODS = (1.5, 40.0)
+# Of a period over the travel between neighbours of the grid; a wave is lost from a whole one on.
+_PERIOD_STEP = 1 / 3
+
+
+class Transmission:
+    """Δq_i = a_i sin(f_i q_i) + b_i cos(f_i q_i) and their harmonics up to the fourth; f_i unknown.
+
+    The second may be as large as the first (a gear's two teeth in mesh), the third and the fourth are small.
+    """
+
+    name = "transmission"
+    kind: Kind = "joints"
+    description = "a periodic error of a drive, of unknown period, as of a gear, a screw or an encoder"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Nothing is needed."""
+        return ""
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """Sine and cosine of a joint's period, then of its harmonics, joint by joint."""
+        return tuple(
+            Coefficient(f"{j.name} {wave}", j.unit, _PERIODIC[j.unit] * size, joint=j.name, secondary=size < 1)
+            for j in situation.mechanism.joints
+            for wave, size in _HARMONICS
+        )
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """The frequency of each joint's error: whole numbers a turn, or from 1.5 periods over the travel upward."""
+        low, high = (edge.tolist() for edge in situation.workspace)
+        count = len(_HARMONICS)
+        return tuple(
+            Shape(
+                f"{j.name} frequency",
+                f"rad/{j.unit}" if j.unit != "rad" else "1",
+                _frequencies(j.unit, high[i] - low[i]),
+                tuple(range(count * i, count * (i + 1))),
+                refined=j.unit != "rad",
+            )
+            for i, j in enumerate(situation.mechanism.joints)
+        )
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x 8n`."""
+        return by_joint(self._moves(situation.joints, shape))
+
+    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
+
+        rows: which, `t`; None = all. Returns `... x t x m`.
+        """
+        return one_by_one(self._moves(of_rows(situation.joints, rows), shape))
+
+    def _moves(self, joints: Tensor, shape: Tensor) -> Tensor:
+        angle = joints * shape.unsqueeze(-2)
+        sine, cosine = torch.sin(angle), torch.cos(angle)
+        waves = [sine, cosine]
+        # The next harmonic by the sum of angles: sines are what a grid of hundreds of frequencies takes its time for.
+        for _ in range(len(_HARMONICS) // 2 - 1):
+            s, c = waves[-2:]
+            waves += [s * cosine + c * sine, c * cosine - s * sine]
+        return torch.stack(waves, -1)
+
+
+def _frequencies(unit: str, travel: float) -> tuple[float, ...]:
+    """Grid of a joint's frequencies, ascending [rad per joint's unit]."""
+    if unit == "rad":
+        return tuple(float(k) for k in range(1, _MOST_PER_TURN + 1))
+    steps = round((_PERIODS[1] - _PERIODS[0]) / _PERIOD_STEP)
+    whole = 2 * math.pi / max(travel, 1e-6)
+    return tuple(whole * (_PERIODS[0] + _PERIOD_STEP * k) for k in range(steps + 1))

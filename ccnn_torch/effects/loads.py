@@ -1,0 +1,256 @@
+"""Members of a machine, and how they deflect under external loads and their own weight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects.columns import by_joint, own_parameters, per_force
+from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
+from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+
+
+class Member(NamedTuple):
+    """A part of the machine: what results call it, and the numbers of its parameters that are lengths."""
+
+    name: str
+    lengths: list[int]
+    leg: int | None
+    joint: str | None
+
+
+def members(mechanism: Mechanism) -> list[Member]:
+    """The parts that have lengths; a length that belongs to no leg is a part of its own."""
+    own = own_parameters(mechanism)
+    found: dict[str, Member] = {}
+    for place, k in enumerate(own):
+        parameter = mechanism.geometry[k]
+        if parameter.unit != "m":
+            continue
+        name, leg, joint = parameter.name, None, None
+        if isinstance(mechanism, SerialArm):
+            i = place * len(mechanism.joints) // len(own)
+            name, joint = f"link {i + 1}", mechanism.joints[i].name
+        elif parameter.leg is not None:
+            name, leg = f"leg {parameter.leg}", parameter.leg
+        if name not in found:
+            found[name] = Member(name, [], leg, joint)
+        found[name].lengths.append(k)
+    return list(found.values())
+
+
+def arm_axes(arm: SerialArm, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """A point on each joint's axis and the axis' direction in the base frame, `... x n x 3` each [m], [1]."""
+    frames = arm.link_frames(joints, values)
+    holders = frames[:-1] if arm._axis_before else frames[1:]
+    base = rotation_vector_to_matrix(values[..., 3:6])
+    points = torch.stack([place for _, place in holders], -2) @ base.mT + values[..., None, :3]
+    axes = (torch.stack([turn for turn, _ in holders], -3) @ arm.axes.unsqueeze(-1)).squeeze(-1) @ base.mT
+    return points, axes
+
+
+SCALE = {"m": 1e-7, "rad": 2e-6}
+"""Plausible compliance of a drive: 1e-7 m/N (10 N/µm), 2e-6 rad/(N·m)."""
+_SECONDARY = 0.3
+# How far from the measured point a load may act [m].
+_AWAY = 0.1
+# What a joint carries, by and large [N], [N·m]: stiffening is given there.
+_TYPICAL = {"m": 100.0, "rad": 30.0}
+
+
+class Compliance:
+    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = force or torque of the load on the joint; and
+    members that give, e_k.
+
+    τ_0 = 100 N or 30 N·m: d and h are changes of compliance there. Secondary as well, the members: a leg stretches in
+    all its lengths p in proportion to the force of the load on them, Δp = e (∂x/∂p) · load (virtual work); a link of an
+    arm tilts at its joint under the part of the moment that the joint does not carry. All to first order about the
+    nominal pose, so that the effect is one on the pose.
+    """
+
+    name = "compliance"
+    kind: Kind = "pose"
+    description = "deflection of joints, legs and links under an external load (linear and stiffening)"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """A load that was measured."""
+        there = any(f"load_{c.name}" in covariates for c in mechanism.pose)
+        along = " or ".join(f"load_{c.name}[{'N' if c.unit == 'm' else 'N*m'}]" for c in mechanism.pose)
+        return "" if there else f"a column of the load on the platform: {along}"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """One a joint, then two a joint for what is not proportional, then the members."""
+        mechanism = situation.mechanism
+        found = [
+            Coefficient(
+                f"{j.name}{part}",
+                per_force(j.unit),
+                SCALE[j.unit] * (_SECONDARY if part else 1.0),
+                joint=j.name,
+                secondary=bool(part),
+                positive=not part,
+            )
+            for part in ("", " stiffening", " hardening")
+            for j in mechanism.joints
+        ]
+        if isinstance(mechanism, SerialArm):
+            tilt, away = SCALE["rad"] * _SECONDARY, SCALE["rad"] * _AWAY
+            turning = [mechanism.joints[i].name for i in _turning(mechanism)]
+            return (
+                *found,
+                *(Coefficient(f"{j.name} tilt", "rad/N/m", tilt, j.name, None, True) for j in mechanism.joints),
+                *(Coefficient(f"{j} load {axis}", "rad/N", away, j, None, True) for j in turning for axis in "xyz"),
+            )
+        stretch = SCALE["m"] * _SECONDARY
+        return (*found, *(Coefficient(m.name, "m/N", stretch, m.joint, m.leg, True) for m in members(mechanism)))
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """None."""
+        return ()
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x c x m`."""
+        jacobian, torque = torch.nan_to_num(situation.jacobian), situation.load_torque
+        typical = torch.tensor([_TYPICAL[j.unit] for j in situation.mechanism.joints], dtype=torch.float64)
+        ratio = torque.abs() / typical
+        parts = [jacobian * (torque * ratio**k).unsqueeze(-2) for k in range(3)]
+        arm = isinstance(situation.mechanism, SerialArm)
+        return torch.cat([*parts, *_of_an_arm(situation)] if arm else [*parts, _stretching(situation)], -1)
+
+
+def _stretching(situation: Situation) -> Tensor:
+    """Change of the pose by the members of a machine with legs, `... x s x c x (members)`."""
+    slope = torch.nan_to_num(situation.parameter_jacobian)
+    torques = slope.mT @ situation.wrench.unsqueeze(-1)
+    found = members(situation.mechanism)
+    moved = [slope[..., m.lengths] @ torques[..., m.lengths, :] for m in found]
+    return torch.cat(moved, -1) if found else slope[..., :0]
+
+
+def _turning(mechanism: Mechanism) -> list[int]:
+    return [i for i, j in enumerate(mechanism.joints) if j.unit == "rad"]
+
+
+def _of_an_arm(situation: Situation) -> list[Tensor]:
+    """Change of the pose by links that tilt at their joints, `... x s x c x n`, and by joints that give under the
+    moment of a load that acts 1 m away from the measured point along each axis of the tool, `... x s x c x 3t`."""
+    arm = situation.mechanism
+    assert isinstance(arm, SerialArm)
+    points, axes = arm_axes(arm, situation.joints, arm.resolve(situation.parameters))
+    place, rotation = situation.platform
+    assert rotation is not None
+    lever = place.unsqueeze(-2) - points
+    wrench = situation.wrench.unsqueeze(-2)
+    force = wrench[..., :3]
+    moment = torch.linalg.cross(*torch.broadcast_tensors(lever, force), dim=-1)  # type: ignore[no-untyped-call]
+    if wrench.shape[-1] == 6:
+        moment = moment + wrench[..., 3:]
+    across = moment - (moment * axes).sum(-1, keepdim=True) * axes
+    shift = torch.linalg.cross(across, lever, dim=-1)
+    tilting = (shift if wrench.shape[-1] == 3 else torch.cat([shift, across], -1)).mT
+    away = torch.linalg.cross(*torch.broadcast_tensors(rotation.mT, force), dim=-1)  # type: ignore[no-untyped-call]
+    turning = _turning(arm)
+    torque = (axes @ away.mT)[..., turning, :]
+    jacobian = torch.nan_to_num(situation.jacobian)[..., turning]
+    return [tilting, (jacobian.unsqueeze(-1) * torque.unsqueeze(-3)).flatten(-2)]
+
+
+# What an arm may carry elsewhere than evenly: no correction of a form.
+_MASSES = ("tool", "inner links")
+# Lever by which a turning joint carries weight, by and large [m]; a sliding one carries a share of it [1].
+_LEVER = 0.3
+# Weight times the way from the measured point to the centre of mass [N·m].
+_MOMENT = 5.0
+
+
+class Gravity:
+    """Δq_i = c_i τ_i, τ = force or torque of the machine's own weight on the joint per newton, by virtual work.
+
+    For an arm the newton is spread evenly over the origins of its links and the tool; for other machines it hangs on
+    the measured point of the platform. c is compliance times weight: a sag for each metre of lever (turning joints), or
+    along a joint that carries all (sliding ones). Secondary: a joint that stiffens, d τ|τ| / 0.3 m (or / 1); what
+    another mass distribution does: for an arm a weight at the tool, and one that is larger towards the base; for a
+    turning drive of another machine its crank, whose weight acts in proportion to cos q and sin q, and for a platform
+    that turns the moment of its weight about the measured point, in its own axes, on drives of plausible compliance.
+    """
+
+    name = "gravity"
+    kind: Kind = "joints"
+    description = "deflection under the machine's own weight"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Nothing is needed."""
+        return ""
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """Sag of each joint and what goes with it, joint by joint; then the centre of mass."""
+        mechanism, found = situation.mechanism, []
+        for joint in mechanism.joints:
+            turning = joint.unit == "rad"
+            unit, size = "rad/m" if turning else "m", SCALE[joint.unit] * PLATFORM_WEIGHT
+            found.append(Coefficient(joint.name, unit, size, joint=joint.name, positive=True))
+            parts = [("stiffening", unit, size)]
+            if isinstance(mechanism, SerialArm):
+                parts += [("tool", unit, size), ("inner links", unit, size)]
+            elif turning:
+                parts += [(f"crank {wave}", "rad", size * _LEVER) for wave in ("cos", "sin")]
+            # No input link weighs many times as much as the platform; a tool may.
+            found += [
+                Coefficient(
+                    f"{joint.name} {part}",
+                    u,
+                    _SECONDARY * v,
+                    joint=joint.name,
+                    secondary=True,
+                    mends=part not in _MASSES,
+                )
+                for part, u, v in parts
+            ]
+        if _centred(situation):
+            found += [Coefficient(f"centre {axis}", "N*m", _MOMENT, secondary=True) for axis in "xyz"]
+        return tuple(found)
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """None."""
+        return ()
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x m`."""
+        mechanism, joints = situation.mechanism, situation.joints
+        turning = [j.unit == "rad" for j in mechanism.joints]
+        lever = torch.tensor([_LEVER if turns else 1.0 for turns in turning], dtype=joints.dtype)
+        arm = isinstance(mechanism, SerialArm)
+        weight = situation.own_weight_torque
+        parts = [weight, weight * weight.abs() / lever]
+        if arm:
+            parts += [situation.weight_torque, situation.inner_weight_torque]
+        else:
+            parts += [torch.cos(joints), torch.sin(joints)]
+        columns = by_joint(torch.stack(parts, -1))
+        if not arm:
+            kept = [4 * i + k for i, turns in enumerate(turning) for k in (range(4) if turns else range(2))]
+            columns = columns[..., kept]
+        return torch.cat([columns, _off_centre(situation)], -1) if _centred(situation) else columns
+
+
+def _centred(situation: Situation) -> bool:
+    """Whether the platform's centre of mass has columns: it turns, and is no arm's, whose tool is small."""
+    return not isinstance(situation.mechanism, SerialArm) and situation.platform[1] is not None
+
+
+def _off_centre(situation: Situation) -> Tensor:
+    """Change of the joints by a moment of 1 N·m of the weight along each axis of the platform, `... x s x n x 3`."""
+    rotation = situation.platform[1]
+    assert rotation is not None
+    moment = torch.linalg.cross(rotation.mT, situation.down.expand_as(rotation), dim=-1)
+    scale = torch.tensor([SCALE[j.unit] for j in situation.mechanism.joints], dtype=rotation.dtype)
+    jacobian = torch.nan_to_num(situation.jacobian)
+    torques: Tensor = jacobian[..., 3:, :].mT @ moment.mT
+    return scale[:, None] * torques

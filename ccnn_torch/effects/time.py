@@ -1,0 +1,342 @@
+"""Effects that depend on the column of times: latency, thermal growth, drift."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
+from ccnn_torch.effects.loads import Member, members
+from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.situation import Situation
+from ccnn_torch.mechanisms import Mechanism
+
+# Rows farther apart are not one trajectory [s].
+_SAME_MOTION = 1.0
+
+
+def elapsed(time: Tensor) -> Tensor:
+    """Time since the first row, `... x s` [s]."""
+    return time - time.amin(-1, keepdim=True)
+
+
+def lagged(time: Tensor, value: Tensor, lag: Tensor) -> Tensor:
+    """A body of one heat capacity behind its surroundings: y' = (value - y) / lag, settled at the first time.
+
+    Exact for a value that is linear between the rows. The recurrence y_k = a_k y_(k-1) + b_k over the rows in the order
+    of time is solved by doubling (Hillis and Steele 1986): log2(s) steps for all rows at once, and no exponential of a
+    large number, as a running sum would need.
+
+    Args:
+        time: `... x s` [s], in any order.
+        value: `... x s`.
+        lag: `...` [s]; 0 = no lag.
+
+    Returns:
+        `... x s`.
+    """
+    time, value, behind = torch.broadcast_tensors(time, value, lag.unsqueeze(-1))  # type: ignore[no-untyped-call]
+    order = torch.argsort(time, dim=-1, stable=True)
+    t, v, behind = time.gather(-1, order), value.gather(-1, order), behind[..., 1:].clamp_min(1e-9)
+    ratio = t.diff(dim=-1) / behind
+    keep = torch.exp(-ratio)
+    # Mean of what has passed, weighted by what is kept of it: (1 - e^-r)/r, near 0 by its series.
+    small = ratio < 1e-6
+    safe = torch.where(small, 1.0, ratio)
+    mean = torch.where(small, 1 - ratio / 2, -torch.expm1(-safe) / safe)
+    gain = v[..., 1:] * (1 - mean) + v[..., :-1] * (mean - keep)
+    factor = torch.cat([torch.zeros_like(v[..., :1]), keep], -1)
+    state = torch.cat([v[..., :1], gain], -1)
+    reach = 1
+    while reach < state.shape[-1]:
+        state = torch.cat([state[..., :reach], state[..., reach:] + factor[..., reach:] * state[..., :-reach]], -1)
+        factor = torch.cat([factor[..., :reach], factor[..., reach:] * factor[..., :-reach]], -1)
+        reach *= 2
+    return torch.zeros_like(state).scatter(-1, order, state)
+
+
+def velocity(time: Tensor, joints: Tensor) -> Tensor:
+    """Velocities by differences of the neighbouring rows in time, `... x s x n` [joint's unit per s].
+
+    Rows more than a second from either neighbour are not part of a trajectory: their velocity is 0.
+
+    Args:
+        time: `... x s` [s], in any order.
+        joints: `... x s x n`.
+    """
+    if joints.shape[-2] < 2:
+        return torch.zeros_like(joints)
+    order = torch.argsort(time.expand(joints.shape[:-1]), dim=-1, stable=True)
+    t = time.expand(joints.shape[:-1]).gather(-1, order)
+    at = order.unsqueeze(-1).expand_as(joints)
+    q = joints.gather(-2, at)
+    gap = t.diff(dim=-1).unsqueeze(-1)
+    moving = (gap > 0) & (gap <= _SAME_MOTION)
+    slope = torch.where(moving, q.diff(dim=-2) / torch.where(moving, gap, 1.0), 0.0)
+    # The parabola through three rows: each side's slope, weighted by the other side's gap.
+    before, after = torch.cat([slope[..., :1, :], slope], -2), torch.cat([slope, slope[..., -1:, :]], -2)
+    first, last = torch.cat([gap[..., :1, :], gap], -2), torch.cat([gap, gap[..., -1:, :]], -2)
+    known = torch.cat([moving[..., :1, :], moving], -2) & torch.cat([moving, moving[..., -1:, :]], -2)
+    whole = (first + last).clamp_min(1e-300)
+    middle = torch.where(known, (before * last + after * first) / whole, 0.0)
+    return torch.zeros_like(joints).scatter(-2, at, middle)
+
+
+_DELAY = 5e-3
+
+
+class Latency:
+    """Δq_i = -(τ + τ_i) dq_i/dt: the machine is where the command was τ before; τ_i is what one drive lags behind.
+
+    Velocities are the columns speed1… where the records have them, else differences along a trajectory: rows that are
+    more than a second apart are none.
+    """
+
+    name = "latency"
+    kind: Kind = "joints"
+    description = "poses recorded on the move that lag behind their commands"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Velocities, or the time along a trajectory."""
+        speeds = [f"speed{i + 1}" for i in range(len(mechanism.joints))]
+        if "time" in covariates or any(s in covariates for s in speeds):
+            return ""
+        unit = mechanism.joints[0].unit
+        return (
+            f"the joints' velocities, speed1[{unit}/s]…, or time[s] along a trajectory with rows under a second apart"
+        )
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """The delay of all, then that of each joint on top."""
+        own = [Coefficient(j.name, "s", 0.3 * _DELAY, joint=j.name, secondary=True) for j in situation.mechanism.joints]
+        return (Coefficient("delay", "s", _DELAY), *own)
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """None."""
+        return ()
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x (1 + n)`."""
+        behind = -_velocity(situation)
+        return torch.cat([behind.unsqueeze(-1), by_joint(behind.unsqueeze(-1))], -1)
+
+
+def _velocity(situation: Situation) -> Tensor:
+    columns = [situation.covariates.get(f"speed{i + 1}") for i in range(situation.joints.shape[-1])]
+    time = situation.covariates.get("time")
+    if time is None or any(c is not None for c in columns):
+        zero = torch.zeros_like(situation.joints[..., 0])
+        return torch.stack([zero if c is None else c.expand_as(zero) for c in columns], -1)
+    return velocity(time, situation.joints)
+
+
+REFERENCE = 293.15
+"""Temperature at which a machine has its dimensions, ISO 1 [K]."""
+_STEEL = 1.2e-5
+# Of a member against the whole machine, and kelvins by which the reference may be off.
+_UNEVEN, _REFERENCE_OFF = 0.5, 5.0
+# A motor's mount of 0.2 m; a beam warped by its two sides.
+_MOUNT = {"m": 2e-6, "rad": 5e-6}
+# Of a drive warmed by its own work [K], and how long that takes [s]; the legs take on a part.
+_OWN_WARMTH, _WARM_UP, _TAKEN_ON = 10.0, 2000.0, 0.4
+_LAGS = 12
+_WARM_SHARES = (0.01, 1.0)
+
+
+class Thermal:
+    """Δp = (α + α_k) p θ for all lengths p (k = their leg or link), Δq_i = β_i q_i θ for sliding drives.
+
+    θ is the temperature less 20 degC, as a body of one heat capacity follows it with a lag: θ' = (T - θ) / lag, settled
+    at the first row. Without a column of times there is no lag. Secondary: mounts that move a joint by γ_i θ; a
+    reference that was not 20 degC (a constant growth); beams that bend by what the surroundings are ahead of the body,
+    T - θ; parts of the growth that follow at once, or with a lag of their own (a core in its skin); and the drives' own
+    warmth, which no thermometer in the hall
+    sees: growth of all and of the sliding drives by 1 - exp(-t / 2000 s).
+
+    Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
+    derivatives, so the effect is one on the pose: no joint has to replace a length (near a singularity of an arm
+    that would take a large one), and growth of 1e-4 leaves 1e-8 to the second order.
+    """
+
+    name = "thermal"
+    kind: Kind = "pose"
+    description = "thermal growth with a first-order lag"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Temperature, and something that has a length."""
+        if not members(mechanism) and all(j.unit != "m" for j in mechanism.joints):
+            return f"lengths: mechanism '{mechanism.name}' has no parameter in metres"
+        return "" if "temperature" in covariates else "the temperature of the surroundings: temperature[degC]"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """The whole machine, its members, its sliding drives; then what is secondary."""
+        mechanism = situation.mechanism
+        found = [Coefficient("growth", "1/K", _STEEL, positive=True)]
+        uneven = _STEEL * _UNEVEN
+        found += [Coefficient(m.name, "1/K", uneven, joint=m.joint, leg=m.leg) for m in _apart(mechanism)]
+        found += [
+            Coefficient(f"{j.name} travel", "1/K", _STEEL, joint=j.name, positive=True)
+            for j in mechanism.joints
+            if j.unit == "m"
+        ]
+        found += [
+            Coefficient(f"{j.name} mount", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
+            for j in mechanism.joints
+        ]
+        found.append(Coefficient("reference", "1", _STEEL * _REFERENCE_OFF, secondary=True))
+        if "time" in situation.covariates:
+            own = _STEEL * _OWN_WARMTH
+            found.append(Coefficient("at once", "1/K", uneven, secondary=True))
+            found.append(Coefficient("late", "1/K", uneven, secondary=True))
+            found += [
+                Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
+                for j in mechanism.joints
+            ]
+            found.append(Coefficient("warm-up", "1", own * _TAKEN_ON, secondary=True))
+            found += [
+                Coefficient(f"{j.name} warm-up", "1", own, joint=j.name, secondary=True)
+                for j in mechanism.joints
+                if j.unit == "m"
+            ]
+        return tuple(found)
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """The lag, from none to the time of all rows; () without times."""
+        if "time" not in situation.covariates:
+            return ()
+        whole = max(float(elapsed(situation.covariates["time"]).max()), 1e-6)
+        low, high = (math.log(share * whole) for share in _WARM_SHARES)
+        lags = [math.exp(low + (high - low) * k / (_LAGS - 1)) for k in range(_LAGS)]
+        late = [c.name for c in self.coefficients(situation)].index("late")
+        every = range(len(self.coefficients(situation)))
+        return (
+            Shape("lag", "s", (0.0, *lags), tuple(k for k in every if k != late)),
+            Shape("late lag", "s", tuple(lags), (late,)),
+        )
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x c x m`."""
+        return situation.once(self.fixed_columns) * self.column_factors(situation, shape).unsqueeze(-2)
+
+    def fixed_columns(self, situation: Situation) -> Tensor:
+        """Of the columns what does not depend on the shapes, `... x s x c x m`, to be times `column_factors`."""
+        mechanism = situation.mechanism
+        values = mechanism.resolve(situation.parameters).unsqueeze(-2)
+        longer = torch.nan_to_num(situation.parameter_jacobian) * values
+        jacobian = torch.nan_to_num(situation.jacobian)
+        sliding = [i for i, j in enumerate(mechanism.joints) if j.unit == "m"]
+        lengths = [k for m in members(mechanism) for k in m.lengths]
+        whole = longer[..., lengths].sum(-1, keepdim=True)
+        apart = [longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism)]
+        travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
+        parts = [whole, *apart, travel, jacobian, whole]
+        return torch.cat([*parts, *([whole, whole, jacobian, whole, travel] if _timed(situation) else [])], -1)
+
+    def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
+        """What each of the fixed columns is multiplied by: warmth [K], or what has become of it, `... x s x m`."""
+        mechanism = situation.mechanism
+        warm = (situation.covariates["temperature"] - REFERENCE).expand(situation.joints.shape[:-1])
+        n, sliding = len(mechanism.joints), sum(j.unit == "m" for j in mechanism.joints)
+        following, one = 1 + len(_apart(mechanism)) + sliding + n, torch.ones_like(warm)
+        if not _timed(situation):
+            kinds = [(warm, following), (one, 1)]
+        else:
+            time = situation.covariates["time"]
+            body, core = (lagged(time, warm, shape[..., k]) for k in (0, 1))
+            own = -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
+            kinds = [(body, following), (one, 1), (warm, 1), (core, 1), (warm - body, n), (own, 1 + sliding)]
+        each = torch.stack(torch.broadcast_tensors(*(k for k, _ in kinds)), -1)  # type: ignore[no-untyped-call]
+        return each[..., [i for i, (_, count) in enumerate(kinds) for _ in range(count)]]
+
+
+def _timed(situation: Situation) -> bool:
+    return "time" in situation.covariates
+
+
+def _apart(mechanism: Mechanism) -> list[Member]:
+    """Members that may grow unlike each other; a single one is the whole machine."""
+    found = members(mechanism)
+    return found if len(found) > 1 else []
+
+
+# In an hour.
+_SCALE = {"m": 3e-5, "rad": 5e-5}
+_HOUR = 3600.0
+# Terms of the random walk's expansion; what they leave out is 5 % of its variance at its end.
+_WALK = 4
+_RATES = 8
+# The logarithm's time constant, as shares of the whole time.
+_SHARES = (0.003, 1.0)
+
+
+class Drift:
+    """Δq_i = a_i t + b_i ln(1 + t / r) + a random walk; t since the first row.
+
+    r is how long it takes for the drift to slow down. The random walk (secondary) is the Karhunen-Loève expansion of
+    Brownian motion over the time T of the rows, its first four terms √2 sin((k - ½) π t / T) / ((k - ½) π).
+    """
+
+    name = "drift"
+    kind: Kind = "joints"
+    description = "drift of the joints in time: linear, logarithmic, or random"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Time."""
+        return "" if "time" in covariates else "the time of each row: time[s]"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """Steady, logarithmic, and the terms of the random walk, joint by joint."""
+        found = []
+        for j in situation.mechanism.joints:
+            size = _SCALE[j.unit]
+            found.append(Coefficient(f"{j.name} steady", f"{j.unit}/s", size / _HOUR, joint=j.name))
+            found.append(Coefficient(f"{j.name} slowing", j.unit, size / 3, joint=j.name))
+            found += [
+                Coefficient(f"{j.name} walk {k + 1}", j.unit, size / 2, joint=j.name, secondary=True)
+                for k in range(_WALK)
+            ]
+        return tuple(found)
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """The time in which the drift slows down."""
+        whole = _duration(situation)
+        low, high = (math.log(share * whole) for share in _SHARES)
+        step = (high - low) / (_RATES - 1)
+        return (Shape("slowing", "s", tuple(math.exp(low + step * k) for k in range(_RATES)), _slowing(situation)),)
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x 6n`."""
+        return by_joint(self._moves(situation, shape))
+
+    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
+
+        rows: which, `t`; None = all. Returns `... x t x m`.
+        """
+        return one_by_one(of_rows(self._moves(situation, shape), rows, -3))
+
+    def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
+        time = elapsed(situation.covariates["time"]).expand(situation.joints.shape[:-1])
+        whole = _duration(situation)
+        share = time / whole
+        rate = shape.clamp_min(1e-9)
+        parts = [time, torch.log1p(time / rate)]
+        turns = [(k + 0.5) * math.pi for k in range(_WALK)]
+        parts += [math.sqrt(2) * torch.sin(turn * share) / turn for turn in turns]
+        same = torch.stack(torch.broadcast_tensors(*parts), -1)  # type: ignore[no-untyped-call]
+        return same.unsqueeze(-2).expand(*same.shape[:-1], situation.joints.shape[-1], -1)
+
+
+def _duration(situation: Situation) -> float:
+    """Of the longest set of rows [s]."""
+    return max(float(elapsed(situation.covariates["time"]).max()), 1e-6)
+
+
+def _slowing(situation: Situation) -> tuple[int, ...]:
+    return tuple((2 + _WALK) * i + 1 for i in range(len(situation.mechanism.joints)))
