@@ -9,7 +9,7 @@ from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import Identification, identify
 from ccnn_torch.identification.outputs import RESULTS, write_outputs
-from ccnn_torch.identification.page.tables import not_settled, print_identified
+from ccnn_torch.identification.page.tables import identified_page, not_settled
 from ccnn_torch.report.screen import note, progress_bar, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, kept_for
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
@@ -61,7 +61,7 @@ def _run(config: IdentifyConfig, path: Path, quiet: bool) -> Identification:
         found = identify(config, path / "methods", watch)
     if not quiet:
         # Before anything is written: what was found is not lost where the disk is full.
-        print_identified(found.results, stdout)
+        identified_page(found.results).show(stdout)
     note("writing tables, plots and files …", quiet)
     with kept_for(f"ccnn identify --resume {path}"):
         write_outputs(found, path)
