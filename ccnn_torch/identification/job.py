@@ -7,7 +7,7 @@ from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import identify
 from ccnn_torch.identification.outputs import RESULTS, write_outputs
-from ccnn_torch.identification.page.tables import not_settled, print_identified
+from ccnn_torch.identification.page.tables import identified_page, not_settled
 from ccnn_torch.report.screen import note, progress_bar, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, resume_hint
 from ccnn_torch.run_folder.resume import FolderJob
@@ -24,7 +24,7 @@ def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, ta
         found = identify(config, path / "methods", watch)
     if tables and not quiet:
         # Before anything is written: what was found is not lost where the disk is full.
-        print_identified(found.results, stdout)
+        identified_page(found.results).show(stdout)
     note("writing tables, plots and files …", quiet)
     with resume_hint(f"ccnn identify --resume {path}"):
         write_outputs(found, path)

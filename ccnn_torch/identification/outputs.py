@@ -7,7 +7,7 @@ from pathlib import Path
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.page.report import write_identified_report
-from ccnn_torch.identification.page.tables import identified_markdown, write_identified_csv
+from ccnn_torch.identification.page.tables import identified_page, write_identified_csv
 from ccnn_torch.mechanisms.files.write_arm import write_machine
 from ccnn_torch.report.arrays import ARRAYS_FILE, save_tensors
 from ccnn_torch.report.json_files import write_json
@@ -20,7 +20,7 @@ def write_outputs(found: Identification, folder: Path) -> None:
     """Write everything; `identified.json` comes last: a folder that has it is finished."""
     results = found.results
     write_identified_csv(folder / "identified.csv", results)
-    write_whole(folder / "identified.md", identified_markdown(results))
+    write_whole(folder / "identified.md", identified_page(results).markdown())
     save_tensors(folder / ARRAYS_FILE, found.arrays)
     # Of several machines the first.
     config = found.config

@@ -68,6 +68,14 @@ class RunArrays:
     labels: dict[str, str] = field(default_factory=dict)
     """Words for the pictures, for example `{"method": "ccnn", "repeat": "3", "mechanism": "tripod"}`."""
 
+    @property
+    def pose_errors(self) -> list[tuple[str, str, Array, Array]]:
+        """Title, unit, before and after of the position and, where there is one, of the orientation."""
+        pairs = [("position error", "m", self.position_before, self.position_after)]
+        if self.rotation_before is not None and self.rotation_after is not None:
+            pairs.append(("rotation error", "rad", self.rotation_before, self.rotation_after))
+        return pairs
+
     def __post_init__(self) -> None:
         rows, joints = self.commanded.shape
         wanted = {

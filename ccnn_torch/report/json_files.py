@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from pydantic import BaseModel
 
 from ccnn_torch.errors import InputError
@@ -33,7 +32,8 @@ def plain(value: Any) -> Any:
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
-    if isinstance(value, torch.Tensor):
+    # A tensor; torch itself takes a second to load, which commands that only read results need not wait for.
+    if hasattr(value, "detach"):
         return plain(value.detach().cpu().numpy())
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())

@@ -45,9 +45,7 @@ def predicted_plot(arrays: RunArrays) -> Plot:
 @styled
 def pose_rows_plot(arrays: RunArrays) -> Plot:
     """Position (and rotation) error of each row, before and after."""
-    pairs = [("position error", "m", arrays.position_before, arrays.position_after)]
-    if arrays.rotation_before is not None and arrays.rotation_after is not None:
-        pairs.append(("rotation error", "rad", arrays.rotation_before, arrays.rotation_after))
+    pairs = arrays.pose_errors
     figure = Figure(figsize=(8.2, 2.2 * len(pairs) + 0.5), layout="constrained")
     row = np.arange(1, len(arrays.commanded) + 1)
     raster = len(row) > RASTER_ABOVE

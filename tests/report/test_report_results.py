@@ -25,7 +25,7 @@ from ccnn_torch.calibration.statistics import (
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import plain, read_json, write_json
-from ccnn_torch.report.results.run import RunResults
+from ccnn_torch.report.results.run import KnownEffects, RunResults
 
 JOINTS = (Coordinate("q1", "m"), Coordinate("q2", "m"), Coordinate("q3", "m"))
 
@@ -213,7 +213,10 @@ def test_the_schema_refuses_what_the_contract_forbids(results: RunResults) -> No
 def test_a_result_is_read_back_as_it_was_written_or_refused(tmp_path: Path, results: RunResults) -> None:
     path = tmp_path / "results.json"
     write_json(path, results)
-    assert RunResults.read(path) == results
+    again = RunResults.read(path)
+    assert again == results and again["pose"]["position"] == results.pose.position
+    known = KnownEffects.model_validate({"from": "diagnosis.json", "test": {}, "coefficients": {}})
+    assert known["from"] == known.source == plain(known)["from"]
     write_json(path, plain(results) | {"seed": "first"})
     with pytest.raises(InputError, match=r"results\.json: is no results\.json of this version: seed: "):
         RunResults.read(path)

@@ -129,22 +129,11 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
     case = build_case(config.case, config.variant or "printed", config.order or "raster")
     mechanism = case.mechanism
     doubts = check_memory(config, len(case.time), len(mechanism.joints))
-    columns = {"t": (case.time, Coordinate("t", "1"))}
-    unknown = [name for name in config.covariates or [] if name not in columns]
-    if unknown:
-        raise InputError(f"covariates: {unknown[0]!r} is no column of the case {config.case}; it has only 't'")
-    chosen = [columns[name] for name in config.covariates or []]
-    covariates = (
-        torch.stack([values for values, _ in chosen], -1) if chosen else case.joints.new_zeros(len(case.time), 0)
-    )
+    chosen = _choose([Coordinate("t", "1")], config.covariates or [], f"case {config.case}")
+    covariates = case.time[:, None] if chosen else case.joints[:, :0]
     noise = case.noise(seeds)
     pose = case.measured(noise)
-    deviations = joint_deviations(
-        mechanism,
-        case.joints,
-        pose,
-        **_pseudoerror_settings(config, mechanism),
-    )
+    deviations = joint_deviations(mechanism, case.joints, pose, **_pseudoerror_settings(config, mechanism))
     splits = _splits(config, mechanism.frame(case.pose)[0], {"t": case.time}, seeds)
     notes = [*doubts, *deviations.notes()]
     if config.covariates is None:
@@ -154,7 +143,7 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
         parameters=None,
         joints=by_repeat(case.joints, seeds),
         covariates=by_repeat(covariates, seeds),
-        covariate_coordinates=tuple(coordinate for _, coordinate in chosen),
+        covariate_coordinates=tuple(chosen),
         pose=pose,
         pseudoerror=deviations,
         total=by_repeat(deviations.deviation, seeds),

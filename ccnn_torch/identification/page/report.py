@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.display import count_text
-from ccnn_torch.identification.page.tables import identified_tables, identified_verdict, unknown_sentences
+from ccnn_torch.identification.page.tables import identified_page
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
 from ccnn_torch.report.json_files import read_json
-from ccnn_torch.report.page import Page, sections_of
 
 _LINKED = (
     "identified.json",
@@ -37,18 +35,4 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
     results = read_json(folder / "identified.json") if results is None else results
     arrays = load_tensors(folder / ARRAYS_FILE)[0]
     figures = inline_figures(identified_plots(results, arrays), folder / "plots")
-    rows, machines = results["rows"], results["machines"]
-    legs = "".join(f", {count} for leg {leg}" for leg, count in sorted(rows["per_leg"].items()))
-    how = f"{count_text(machines, 'machine')} {'simulated' if results['simulated'] else 'measured'}"
-    page = Page(
-        name=results["name"],
-        kind="identification report",
-        verdict=identified_verdict(results),
-        sections=sections_of(identified_tables(results), figures),
-        facts=f"{results['mechanism']} · {rows['train']} poses to identify from{legs}, {rows['test']} held-out poses · "
-        f"{how} · seed {results['seed']}",
-        cautions=unknown_sentences(results),
-        notes=results["notes"],
-        versions=results["versions"],
-    )
-    return page.write_html(folder / "report.html", _LINKED)
+    return identified_page(results, figures).write_html(folder / "report.html", _LINKED)

@@ -7,14 +7,13 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from rich.console import Console
-
 from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.identification.page.constraint import BEFORE_SAYS, constraint_table, holder
 from ccnn_torch.identification.page.paper import paper_tables
 from ccnn_torch.identification.pose_errors import figure_text
 from ccnn_torch.report.csv_file import write_rows
-from ccnn_torch.report.table import Table, markdown_table, print_table, print_text, table_of
+from ccnn_torch.report.page import InlineFigure, Page, sections_of
+from ccnn_torch.report.table import Table, table_of
 
 Block = Mapping[str, Any]
 
@@ -73,19 +72,22 @@ def identified_tables(results: Block) -> list[Table]:
     return [table for table in tables if table is not None]
 
 
-def identified_markdown(results: Block) -> str:
-    """Verdict and tables as Markdown (`identified.md`)."""
-    parts = [f"# {results['name']}", identified_verdict(results), *unknown_sentences(results)]
-    return "\n\n".join([*parts, *map(markdown_table, identified_tables(results)), *results["notes"]]) + "\n"
-
-
-def print_identified(results: Block, console: Console) -> None:
-    """Show the tables and the verdict on a terminal."""
-    for table in identified_tables(results):
-        print_table(table, console)
-    for sentence in (*unknown_sentences(results), *results["notes"]):
-        print_text(sentence, console, "yellow")
-    print_text(identified_verdict(results), console, "bold")
+def identified_page(results: Block, figures: Sequence[InlineFigure] = ()) -> Page:
+    """All that an identification shows."""
+    rows, machines = results["rows"], results["machines"]
+    legs = "".join(f", {count} for leg {leg}" for leg, count in sorted(rows["per_leg"].items()))
+    how = f"{count_text(machines, 'machine')} {'simulated' if results['simulated'] else 'measured'}"
+    return Page(
+        name=results["name"],
+        kind="identification report",
+        verdict=identified_verdict(results),
+        sections=sections_of(identified_tables(results), figures),
+        facts=f"{results['mechanism']} · {rows['train']} poses to identify from{legs}, {rows['test']} held-out poses · "
+        f"{how} · seed {results['seed']}",
+        cautions=unknown_sentences(results),
+        notes=results["notes"],
+        versions=results["versions"],
+    )
 
 
 def unknown_sentences(results: Block) -> list[str]:

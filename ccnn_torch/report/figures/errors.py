@@ -79,11 +79,7 @@ def draw_joint_error(axes: Axes, arrays: RunArrays, joint: int) -> None:
 @styled
 def pose_error_plot(arrays: RunArrays) -> Plot:
     """Distribution of the held-out pose error before and after, position and (where there is one) orientation."""
-    pairs: list[tuple[str, str, Array, Array]] = [
-        ("position error", "m", arrays.position_before, arrays.position_after)
-    ]
-    if arrays.rotation_before is not None and arrays.rotation_after is not None:
-        pairs.append(("rotation error", "rad", arrays.rotation_before, arrays.rotation_after))
+    pairs = arrays.pose_errors
     figure = Figure(figsize=(4.6 * len(pairs) + (1.2 if len(pairs) == 1 else 0), 3.5), layout="constrained")
     medians = []
     for axes, (title, unit, before, after) in zip(figure.subplots(1, len(pairs), squeeze=False)[0], pairs, strict=True):

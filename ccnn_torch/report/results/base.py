@@ -28,7 +28,8 @@ class Result(BaseModel):
     model_config = ConfigDict(extra="forbid", populate_by_name=True, defer_build=True)
 
     def __getitem__(self, key: str) -> Any:
-        return getattr(self, key)
+        fields = type(self).model_fields.items()
+        return getattr(self, next((name for name, field in fields if field.serialization_alias == key), key))
 
     @classmethod
     def read(cls, path: Path) -> Self:
