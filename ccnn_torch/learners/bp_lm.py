@@ -22,6 +22,7 @@ from ccnn_torch.evolution.refinement_state import (
     RefinementState,
     part_of_problem,
 )
+from ccnn_torch.evolution.settings import check_least
 from ccnn_torch.learners.one_network import OneNetwork
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
@@ -57,9 +58,7 @@ class BPLMSettings:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         if not self.hidden or not all(width >= 1 for width in self.hidden):
             raise ValueError(f"hidden={list(self.hidden)}: at least one hidden layer, each with at least one node")
-        for key in ("restarts", "iterations", "patience"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"{key}={getattr(self, key)} must be at least 1")
+        check_least(self, restarts=1, iterations=1, patience=1)
         if not 0 < self.tolerance < math.inf:
             raise ValueError(f"tolerance={self.tolerance} must be above 0")
 
