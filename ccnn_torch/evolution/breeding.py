@@ -24,6 +24,7 @@ from ccnn_torch.evolution.operators import (
 )
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.settings import EvolutionSettings
+from ccnn_torch.numerics.trees import joined, mapped
 
 # What paper 000 leaves open and what made no difference on its cases: contestants of one tournament, cut points of a
 # crossover. b of eq. 13 is the paper's.
@@ -120,9 +121,7 @@ def _children(
         crossed: which pairs are crossed, `r x h`.
     """
     half = crossed.shape[1]
-    mothers, fathers = (
-        Genome(parents.mask[:, part], parents.weight[:, part]) for part in (slice(0, half), slice(half, None))
-    )
+    mothers, fathers = mapped(lambda value: value[:, :half], parents), mapped(lambda value: value[:, half:], parents)
     shape = parents.weight.shape[2:]
     swap = swap_genes(draws.places, math.prod(shape)).reshape(-1, half, *shape)
     first, second = crossover(mothers, fathers, swap & crossed[..., None, None])
@@ -131,7 +130,7 @@ def _children(
     chosen = (draws.genes < settings.weight_mutation) | weakest_draw(second, draws.genes)
     second = nonuniform_mutation(second, chosen, draws.steps, progress, -limit, limit, EXPONENT)
     count = settings.population - settings.elites
-    return Genome(*(torch.cat(pair, dim=1)[:, :count] for pair in zip(first, second, strict=True)))
+    return mapped(lambda one, other: torch.cat([one, other], 1)[:, :count], first, second)
 
 
 def with_elites(
@@ -149,4 +148,4 @@ def with_elites(
         others = fitness.masked_fill(fitness == fitness.amax(-1, keepdim=True), -torch.inf)
         parts.append(select(population, others.topk(settings.elites - 1, dim=-1).indices))
     parts.append(children)
-    return Genome(torch.cat([p.mask for p in parts], dim=1), torch.cat([p.weight for p in parts], dim=1))
+    return joined(parts, 1)

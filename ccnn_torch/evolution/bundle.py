@@ -1,8 +1,7 @@
-"""A batch of networks with their periodic nodes, as one value to pick from, mix and average."""
+"""A batch of networks with their periodic nodes, as one value."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.evolution.network import average, average_waves
 from ccnn_torch.evolution.waves import Waves
+from ccnn_torch.numerics.trees import mapped
 
 
 class Bundle(NamedTuple):
@@ -48,22 +48,6 @@ class Bundle(NamedTuple):
         )
 
 
-def mapped(bundle: Bundle, function: Callable[[Tensor], Tensor]) -> Bundle:
-    """Every tensor through a function."""
-    return Bundle.from_tensors({name: function(value) for name, value in bundle.tensors.items()})
-
-
-def choose(first: Tensor, one: Bundle, other: Bundle) -> Bundle:
-    """Network by network. first: bool, the leading dimensions of the bundles."""
-    ours, theirs = one.tensors, other.tensors
-    return Bundle.from_tensors(
-        {
-            name: torch.where(first.view(*first.shape, *([1] * (ours[name].dim() - first.dim()))), ours[name], value)
-            for name, value in theirs.items()
-        }
-    )
-
-
 def resized(bundle: Bundle, slots: int) -> Bundle:
     """The same networks with fewer free slots for periodic nodes (the last ones go), or more."""
     have = bundle.slots
@@ -79,7 +63,7 @@ def resized(bundle: Bundle, slots: int) -> Bundle:
     return Bundle(
         [*bundle.masks[:-1], columns(bundle.masks[-1])],
         [*bundle.weights[:-1], columns(bundle.weights[-1])],
-        Waves(*(fitted(part) for part in bundle.waves)),
+        mapped(fitted, bundle.waves),
     )
 
 

@@ -19,6 +19,7 @@ from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
 from ccnn_torch.evolution.genome import Genome, kept, select
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.numerics.trees import chosen, joined
 
 _T = TypeVar("_T")
 
@@ -104,7 +105,7 @@ def _judge(state: Coevolution, layer: int, population: Genome, company: Tensor, 
     best_company, which = scores.max(-1)
     winner_fitness, winner = best_company.max(-1, keepdim=True)
     beside = which.gather(-1, winner)
-    joined = [
+    parts = [
         select(population, winner) if number == layer else select(companion, beside)
         for number, companion in enumerate(companions)
     ]
@@ -113,7 +114,7 @@ def _judge(state: Coevolution, layer: int, population: Genome, company: Tensor, 
         populations=_put(state.populations, layer, population),
         fitness=_put(state.fitness, layer, best_company),
     )
-    return _keep_best(renewed, joined, winner_fitness.squeeze(-1))
+    return _keep_best(renewed, parts, winner_fitness.squeeze(-1))
 
 
 def _companions(state: Coevolution, company: Tensor) -> list[Genome]:
@@ -124,9 +125,7 @@ def _companions(state: Coevolution, company: Tensor) -> list[Genome]:
     companions = []
     for number, (population, best) in enumerate(zip(state.populations, state.best, strict=True)):
         others = select(population, (company[:, number] * population.mask.shape[1]).long())
-        companions.append(
-            Genome(torch.cat([best.mask, others.mask], dim=1), torch.cat([best.weight, others.weight], dim=1))
-        )
+        companions.append(joined([best, others], 1))
     return companions
 
 
@@ -140,14 +139,10 @@ def keep_refined(state: Coevolution, refined: Sequence[Genome], scores: Tensor) 
     return _keep_best(state, [Genome(g.mask, kept(*g)) for g in refined], scores)
 
 
-def _keep_best(state: Coevolution, joined: Sequence[Genome], scores: Tensor) -> Coevolution:
+def _keep_best(state: Coevolution, networks: Sequence[Genome], scores: Tensor) -> Coevolution:
     better = scores > state.best_fitness
-    take = better[:, None, None, None]
-    best = tuple(
-        Genome(torch.where(take, new.mask, old.mask), torch.where(take, new.weight, old.weight))
-        for new, old in zip(joined, state.best, strict=True)
-    )
-    return replace(state, best=best, best_fitness=torch.where(better, scores, state.best_fitness))
+    best, fittest = chosen(better, (tuple(networks), scores), (state.best, state.best_fitness))
+    return replace(state, best=best, best_fitness=fittest)
 
 
 def density(populations: Sequence[Genome]) -> Tensor:

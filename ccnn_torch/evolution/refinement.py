@@ -29,12 +29,10 @@ from ccnn_torch.evolution.refinement_state import (
     RefinementSettings,
     RefinementState,
     SecondOrder,
-    chosen_state,
     part_of_problem,
-    part_of_state,
-    put_part,
 )
 from ccnn_torch.evolution.waves import Waves
+from ccnn_torch.numerics.trees import chosen, picked, put
 
 _PRECISION_RANGE = (1e-8, 1e12)
 _DAMPING_RANGE = (1e-12, 1e12)
@@ -86,21 +84,21 @@ def refine(
         if len(going) == 0:
             break
         # Networks do not know of each other, so that those which are done need not be worked on for the others' sake.
-        part, now = part_of_problem(problem, going), part_of_state(state, going)
+        part, now = part_of_problem(problem, going), picked(state, going)
         local = second_order(part, now)
         if problem.settings.bayesian and int(state.iteration) > problem.settings.warm_up:
             evidence = log_evidence(part, now, local)
             risen = evidence > highest[going]
-            best = put_part(best, going, chosen_state(risen, now, part_of_state(best, going)))
+            best = put(best, going, chosen(risen, now, picked(best, going)))
             much = evidence > highest[going] + _NATS
             stale = stale.index_copy(0, going, torch.where(much, 0, stale[going] + 1))
             highest = highest.index_copy(0, going, torch.where(risen, evidence, highest[going]))
-        state = put_part(state, going, step_refinement(part, now, local))
+        state = put(state, going, step_refinement(part, now, local))
     if problem.settings.bayesian and bool((highest > -torch.inf).any()):
         # The last one has not been judged; re-estimated precisions may have taken it downhill.
         last = log_evidence(problem, state)
         worse = torch.nonzero(~(last >= highest) & (highest > -torch.inf)).flatten()
-        state = replace(put_part(state, worse, part_of_state(best, worse)), iteration=state.iteration)
+        state = replace(put(state, worse, picked(best, worse)), iteration=state.iteration)
     worse = ~(_objective(problem, state, state.weights) <= _objective(problem, state, start.weights))
     state = replace(state, weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
     return finish_refinement(problem, state)
@@ -214,7 +212,7 @@ def step_refinement(
         root, failed = torch.linalg.cholesky_ex(damped)
         step = torch.cholesky_solve(gradient[todo].unsqueeze(-1), root).squeeze(-1)
         candidate = state.weights[todo].scatter_add(1, kept[todo], -step)
-        after = _objective(part_of_problem(problem, todo), part_of_state(state, todo), candidate)
+        after = _objective(part_of_problem(problem, todo), picked(state, todo), candidate)
         good = (failed == 0) & (after < before[todo])
         weights = weights.index_copy(0, todo, torch.where(good.unsqueeze(-1), candidate, weights[todo]))
         reached = reached.index_copy(0, todo, torch.where(good, after, reached[todo]))

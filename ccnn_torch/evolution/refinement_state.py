@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.gauss_newton import Network
 from ccnn_torch.evolution.waves import Waves
+from ccnn_torch.numerics.trees import picked
 
 # Calm iterations after which a network is done.
 _CALM = 3
@@ -174,45 +174,5 @@ def part_of_problem(problem: RefinementProblem, index: Tensor) -> RefinementProb
     """The problem of some of the networks, numbered as in the batch; they lead in one dimension."""
     if len(index) == len(problem.rows):
         return problem
-    network = problem.network
-    return replace(
-        problem,
-        leading=(len(index),),
-        network=replace(
-            network,
-            masks=[mask[index] for mask in network.masks],
-            alive=[alive[index] for alive in network.alive],
-            active=network.active[index],
-            source=network.source[index],
-            kept=[kept[index] for kept in network.kept],
-        ),
-        inputs=problem.inputs[index],
-        targets=problem.targets[index],
-        rows=problem.rows[index],
-        metric=None if problem.metric is None else problem.metric[index],
-    )
-
-
-def part_of_state(state: RefinementState, index: Tensor) -> RefinementState:
-    """The state of some of the networks."""
-    tensors = state.state_dict()
-    return RefinementState(**{name: value[index] if value.dim() else value for name, value in tensors.items()})
-
-
-def chosen_state(first: Tensor, one: RefinementState, other: RefinementState) -> RefinementState:
-    """Network by network, `one` where `first` (`b` bool) is set; the iteration is that of `one`."""
-    ours, theirs = one.state_dict(), other.state_dict()
-    return RefinementState(
-        **{
-            name: torch.where(first.view(-1, *([1] * (value.dim() - 1))), value, theirs[name]) if value.dim() else value
-            for name, value in ours.items()
-        }
-    )
-
-
-def put_part(state: RefinementState, index: Tensor, part: RefinementState) -> RefinementState:
-    """A state with that of some of the networks renewed."""
-    old, new = state.state_dict(), part.state_dict()
-    return RefinementState(
-        **{name: old[name].index_copy(0, index, new[name]) if old[name].dim() else new[name] for name in old}
-    )
+    parts = {name: picked(getattr(problem, name), index) for name in ("network", "inputs", "targets", "rows", "metric")}
+    return replace(problem, leading=(len(index),), **parts)

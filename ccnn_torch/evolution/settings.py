@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 _NODES_AN_OUTPUT, _FEWEST_NODES = 8, 24
 _RIVAL, _RIVAL_OUTPUTS = (12, 12), 3
@@ -82,17 +83,8 @@ class CCNNSettings:
             object.__setattr__(self, key, None if layers is None else tuple(layers))
         if self.rival_hidden is not None and not all(width >= 1 for width in self.rival_hidden):
             raise ValueError(f"rival_hidden={list(self.rival_hidden)}: every hidden layer needs at least one node")
-        for key, low in (
-            ("members", 1),
-            ("kept", 1),
-            ("refine_every", 0),
-            ("refinement_iterations", 0),
-            ("waves", 0),
-            ("wave_searches", 0),
-            ("harmonics", 0),
-        ):
-            if getattr(self, key) < low:
-                raise ValueError(f"{key}={getattr(self, key)} must be at least {low}")
+        check_least(self, members=1, kept=1, refine_every=0, refinement_iterations=0)
+        check_least(self, waves=0, wave_searches=0, harmonics=0)
         _check(self)
 
     def structures(self, outputs: int) -> list[tuple[int, ...]]:
@@ -156,9 +148,7 @@ def _check(settings: EvolutionSettings) -> None:
     """
     if not all(width >= 1 for width in settings.hidden or ()):
         raise ValueError(f"hidden={list(settings.hidden or ())}: every hidden layer needs at least one node")
-    for key in ("generations", "elites"):
-        if getattr(settings, key) < 1:
-            raise ValueError(f"{key}={getattr(settings, key)} must be at least 1")
+    check_least(settings, generations=1, elites=1)
     if settings.population < settings.elites + 2:
         raise ValueError(f"population={settings.population} must be at least elites + 2 = {settings.elites + 2}")
     for key in ("crossover", "structural_mutation", "weight_mutation", "density"):
@@ -168,3 +158,14 @@ def _check(settings: EvolutionSettings) -> None:
         raise ValueError(f"weight_range={settings.weight_range} must be above 0")
     if not settings.target_error >= 0:
         raise ValueError(f"target_error={settings.target_error} must not be negative")
+
+
+def check_least(settings: Any, **least: float) -> None:
+    """Check settings that have a least value.
+
+    Raises:
+        ValueError: one is below it, in one sentence with the key.
+    """
+    for key, low in least.items():
+        if not getattr(settings, key) >= low:
+            raise ValueError(f"{key}={getattr(settings, key)} must be at least {low}")

@@ -20,14 +20,13 @@ from ccnn_torch.evolution.refinement import (
 from ccnn_torch.evolution.refinement_state import (
     RefinementSettings,
     RefinementState,
-    SecondOrder,
     part_of_problem,
-    part_of_state,
-    put_part,
 )
+from ccnn_torch.evolution.settings import check_least
 from ccnn_torch.learners.one_network import OneNetwork
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
+from ccnn_torch.numerics.trees import picked, put
 
 _STARTS = 0
 
@@ -59,9 +58,7 @@ class BPLMSettings:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         if not self.hidden or not all(width >= 1 for width in self.hidden):
             raise ValueError(f"hidden={list(self.hidden)}: at least one hidden layer, each with at least one node")
-        for key in ("restarts", "iterations", "patience"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"{key}={getattr(self, key)} must be at least 1")
+        check_least(self, restarts=1, iterations=1, patience=1)
         if not 0 < self.tolerance < math.inf:
             raise ValueError(f"tolerance={self.tolerance} must be above 0")
 
@@ -123,13 +120,10 @@ class BPLM(OneNetwork):
         data = self._data
         going = torch.nonzero(self._rest.flatten() < self.settings.patience).flatten()
         problem = part_of_problem(self._problem, going)
-        moved = step_refinement(
-            problem, part_of_state(self._state, going), SecondOrder(*(part[going] for part in self._known))
-        )
+        moved = step_refinement(problem, picked(self._state, going), picked(self._known, going))
         known = second_order(problem, moved)
         refined = finish_refinement(problem, moved, known)
-        self._state = put_part(self._state, going, moved)
-        self._known = SecondOrder(*(old.index_copy(0, going, new) for old, new in zip(self._known, known, strict=True)))
+        self._state, self._known = put(self._state, going, moved), put(self._known, going, known)
         channels = data.targets.shape[-1] if data.metric is None else data.metric.shape[-2]
         values = (data.weights.sum(-1, keepdim=True) * channels).expand_as(self._evidence).flatten()[going]
         evidence = refined.log_evidence.flatten() / values

@@ -22,6 +22,7 @@ from ccnn_torch.evolution.settings import ENNSettings
 from ccnn_torch.learners.one_network import OneNetwork
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
+from ccnn_torch.numerics.trees import chosen, mapped
 
 # Streams of random numbers: one for the generations, one for each layer's first individuals.
 _GENERATIONS, _FIRST = 0, 1
@@ -57,7 +58,7 @@ class ENN(OneNetwork):
             for layer, (before, after) in enumerate(itertools.pairwise(sizes))
         ]
         self._generation = 0
-        self._best = [Genome(layer.mask[:, :1].clone(), layer.weight[:, :1].clone()) for layer in self._layers]
+        self._best = mapped(lambda value: value[:, :1].clone(), self._layers)
         self._best_fitness = torch.zeros_like(data.weights[:, 0])
         self._judge()
 
@@ -121,14 +122,9 @@ class ENN(OneNetwork):
         """Fitness of the population, and the best network where one beats it."""
         self._fitness = fitness(network_errors(self._layers, self._task))
         highest, which = self._fitness.max(-1, keepdim=True)
-        better = highest > self._best_fitness.unsqueeze(-1)
-        take = better[..., None, None]
-        found = [select(layer, which) for layer in self._layers]
-        self._best = [
-            Genome(torch.where(take, new.mask, old.mask), torch.where(take, new.weight, old.weight))
-            for new, old in zip(found, self._best, strict=True)
-        ]
-        self._best_fitness = torch.maximum(self._best_fitness, highest.squeeze(-1))
+        found = [select(layer, which) for layer in self._layers], highest.squeeze(-1)
+        better = found[1] > self._best_fitness
+        self._best, self._best_fitness = chosen(better, found, (self._best, self._best_fitness))
 
     def _model(self) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of the model, one a layer, `r x 1 x ...`."""

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
+from ccnn_torch.evolution.settings import check_least
 from ccnn_torch.learners.gaussian_process import GPNetwork, covariance, log_evidence, spread_factor
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import usable_rows
@@ -66,9 +67,7 @@ class GPSettings:
     noise_floor: float = 1e-6
 
     def __post_init__(self) -> None:
-        for key, low in (("steps", 1), ("hyperparameter_rows", 2), ("max_rows", 2), ("variance_rows", 1)):
-            if getattr(self, key) < low:
-                raise ValueError(f"{key}={getattr(self, key)} must be at least {low}")
+        check_least(self, steps=1, hyperparameter_rows=2, max_rows=2, variance_rows=1)
         if self.max_rows < self.hyperparameter_rows:
             raise ValueError(
                 f"max_rows={self.max_rows} must be at least hyperparameter_rows={self.hyperparameter_rows}"

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
+from ccnn_torch.evolution.settings import check_least
 from ccnn_torch.learners.grnn_network import GRNNNetwork, KernelVariance
 from ccnn_torch.learners.kernel import FARTHEST, blocked_means
 from ccnn_torch.learners.protocol import TrainingData
@@ -54,9 +55,7 @@ class GRNNSettings:
     references: int = 2000
 
     def __post_init__(self) -> None:
-        for key, low in (("iterations", 1), ("candidates", 2), ("queries", 2), ("references", 2)):
-            if getattr(self, key) < low:
-                raise ValueError(f"{key}={getattr(self, key)} must be at least {low}")
+        check_least(self, iterations=1, candidates=2, queries=2, references=2)
         if not 0 < self.narrowest < self.widest < math.inf:
             raise ValueError(f"narrowest={self.narrowest} must be above 0 and below widest={self.widest}")
         if self.references < self.queries:

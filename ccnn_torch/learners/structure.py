@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from operator import itemgetter
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.bundle import Bundle, averaged, choose, mapped, resized, without_waves
+from ccnn_torch.evolution.bundle import Bundle, averaged, resized, without_waves
 from ccnn_torch.evolution.coevolution import Coevolution, advance, keep_refined, start
 from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
 from ccnn_torch.evolution.genome import Genome
@@ -20,6 +19,7 @@ from ccnn_torch.evolution.refinement_state import Precisions, RefinementSettings
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves
 from ccnn_torch.numerics.blocks import blocks
+from ccnn_torch.numerics.trees import chosen, joined, picked, put
 
 # Passes of one search: after each, what was found before is fitted anew.
 _PASSES = 2
@@ -53,11 +53,8 @@ class MemberRows(NamedTuple):
 
     def of(self, index: Tensor) -> MemberRows:
         """Those of some networks."""
-        metric = None if self.metric is None else self.metric[index]
-        task = Task(*(part[index] for part in self.task))
-        return MemberRows(
-            self.inputs[index], self.targets[index], self.weights[index], metric, self.readable, task, self.seeds[index]
-        )
+        rows = picked((self.inputs, self.targets, self.weights, self.metric, self.task, self.seeds), index)
+        return MemberRows(*rows[:4], self.readable, *rows[4:])
 
 
 class Structure:
@@ -117,9 +114,9 @@ class Structure:
         model, known = self._evolved(), None
         if self._first is not None:
             earlier, precisions, evidence = self._first
-            model = choose(evidence > -torch.inf, earlier, model)
-            known = Precisions(*(part[index] for part in precisions))
-        candidate, evidence, precisions = self._descend(mapped(model, itemgetter(index)), index, known)
+            model = chosen(evidence > -torch.inf, earlier, model)
+            known = picked(precisions, index)
+        candidate, evidence, precisions = self._descend(picked(model, index), index, known)
         self._take(index, candidate, evidence, precisions, evidence > self.evidence[index])
         if self._first is not None:
             return
@@ -137,13 +134,13 @@ class Structure:
             return
         best = self._best()
         index = best.flatten()
-        rows, model = self.rows.of(index), mapped(self.refined, lambda value: value[index])
+        rows, model = self.rows.of(index), picked(self.refined, index)
         each = best.shape[1]
         first = slice(None, None, each)
         left = rows.targets - forward(model.masks, model.weights, rows.inputs, model.waves)
         left = left.unflatten(0, (-1, each)).mean(1)  # type: ignore[no-untyped-call]
         # The members of a repeat share their slots; only the frequencies were refined apart.
-        before = Waves(*(part[first] for part in model.waves))
+        before = picked(model.waves, first)
         found = find_waves(before, left, rows.inputs[first], rows.weights[first], rows.readable, _PASSES)
         fresh = ((found.frequency != 0) & (before.frequency == 0)).repeat_interleave(each, 0)
         going = torch.nonzero(fresh.any(-1)).flatten()
@@ -159,28 +156,21 @@ class Structure:
             Waves(torch.where(fresh, source, model.waves.source), torch.where(fresh, frequency, model.waves.frequency)),
         )
         # With all precisions anew: those of the last descent hold the network where it is.
-        candidate, evidence, precisions = self._descend(mapped(wider, lambda value: value[going]), index[going], None)
+        candidate, evidence, precisions = self._descend(picked(wider, going), index[going], None)
         # A member whose descent failed is replaced by the best of its repeat, and costs the others nothing.
         own = torch.arange(len(evidence), device=evidence.device).reshape(-1, each)
         leader = own.gather(1, evidence.reshape(-1, each).argmax(1, keepdim=True))
         taken_from = torch.where(evidence.reshape(-1, each) > -torch.inf, own, leader).flatten()
-        candidate, evidence = mapped(candidate, lambda value: value[taken_from]), evidence[taken_from]
-        precisions = Precisions(*(part[taken_from] for part in precisions))
+        candidate, evidence, precisions = picked((candidate, evidence, precisions), taken_from)
         # Taken by all members of a repeat or by none, so that they go on sharing their slots.
         gain = (evidence - self.evidence[index[going]]).reshape(-1, each).sum(1).repeat_interleave(each)
         self._take(index[going], candidate, evidence, precisions, gain > 0)
 
     def _take(self, index: Tensor, candidate: Bundle, evidence: Tensor, precisions: Precisions, taken: Tensor) -> None:
         """Keep the refined networks that are `taken`, bool; index: which of the `b` they are."""
-        target = index[taken]
-
-        def put(old: Tensor, new: Tensor) -> Tensor:
-            return old.index_copy(0, target, new[taken])
-
-        old, new = self.refined.tensors, candidate.tensors
-        self.refined = Bundle.from_tensors({name: put(old[name], new[name]) for name in old})
-        self.evidence = put(self.evidence, evidence)
-        self.precisions = Precisions(*(put(*pair) for pair in zip(self.precisions, precisions, strict=True)))
+        found = picked((candidate, evidence, precisions), taken)
+        kept = put((self.refined, self.evidence, self.precisions), index[taken], found)
+        self.refined, self.evidence, self.precisions = kept
 
     def members(self) -> Bundle:
         """The kept members of each repeat, refined where they are: `r x kept x ...`."""
@@ -189,9 +179,9 @@ class Structure:
         rows = self.rows.weights[best].sum(-1) * self.rows.targets.shape[-1]
         # A member that fell short is replaced by a copy of the best one: every repeat has as many networks.
         short = evidence < evidence[:, :1] - _SHORT * rows
-        model = choose(self.evidence > -torch.inf, self.refined, self._evolved())
+        model = chosen(self.evidence > -torch.inf, self.refined, self._evolved())
         voters = torch.where(short, best[:, :1], best)
-        return mapped(model, lambda value: value[voters])
+        return picked(model, voters)
 
     def model(self) -> Bundle:
         """Their mean: `r x ...`."""
@@ -256,17 +246,8 @@ class Structure:
         weights = sum(int(mask.flatten(1).sum(1).max()) + mask.shape[-2] for mask in model.masks)
         parts = []
         for few in blocks(len(index), _MATRICES * 8 * weights**2):
-            here = None if known is None else Precisions(*(part[few] for part in known))
-            parts.append(self._descend_together(mapped(model, itemgetter(few)), index[few], here))
-        if len(parts) == 1:
-            return parts[0]
-        bundles, evidence, precisions = zip(*parts, strict=True)
-        names = bundles[0].tensors
-        return (
-            Bundle.from_tensors({name: torch.cat([one.tensors[name] for one in bundles]) for name in names}),
-            torch.cat(evidence),
-            Precisions(*(torch.cat(part) for part in zip(*precisions, strict=True))),
-        )
+            parts.append(self._descend_together(*picked((model, index, known), few)))
+        return parts[0] if len(parts) == 1 else joined(parts)
 
     def _descend_together(
         self, model: Bundle, index: Tensor, known: Precisions | None

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.numerics.trees import chosen, picked
+
 _EPS = torch.finfo(torch.float64).eps
 _DAMPING_FLOOR, _DAMPING_CEILING = 1e-15, 1e15
 
@@ -148,7 +150,7 @@ def descend(
     evaluations, iterations = len(x), 0
     converged = torch.zeros_like(cost, dtype=torch.bool)
     active = torch.nonzero(torch.isfinite(cost)).squeeze(-1)
-    model = [part[active] for part in model]
+    model = picked(model, active)
     lam = torch.full_like(cost[active], damping)
     before = torch.zeros_like(lam)
     while len(active) and iterations < max_iterations:
@@ -160,30 +162,20 @@ def descend(
         if trusting and bool(done.any()):
             last, left = active[done], ~done
             x[last], cost[last], converged[last] = trial[done], cost[last] - promised[done], True
-            active, lam, promised, trial, done = (part[left] for part in (active, lam, promised, trial, done))
-            model = [part[left] for part in model]
+            active, lam, promised, trial, done, model = picked((active, lam, promised, trial, done, model), left)
             if not len(active):
                 break
         new_cost, *new_model = evaluate(trial, active)
         evaluations += len(active)
         # A rise within rounding counts as no rise: at the minimum neighbouring costs are equal to rounding.
         better = new_cost <= cost[active] * (1 + 4 * _EPS)
-        x[active] = torch.where(better[:, None], trial, x[active])
-        cost[active] = torch.where(better, new_cost, cost[active])
+        x[active], cost[active], model = chosen(better, (trial, new_cost, new_model), (x[active], cost[active], model))
         converged[active] = done
         lam = torch.where(better, lam / 20, lam * 8).clamp(_DAMPING_FLOOR, _DAMPING_CEILING)
         before = torch.where(better, promised, 0.0)
-        model = [_chosen(better, new, old) for new, old in zip(new_model, model, strict=True)]
         if bool(done.any()):
-            left = ~done
-            active, lam, before = active[left], lam[left], before[left]
-            model = [part[left] for part in model]
+            active, lam, before, model = picked((active, lam, before, model), ~done)
     return Descent(x, cost, converged, iterations, evaluations)
-
-
-def _chosen(first: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    """Problem by problem, `one` where `first` (`b`, bool) is set; both `b x …`."""
-    return torch.where(first.reshape(-1, *(1,) * (one.dim() - 1)), one, other)
 
 
 def levenberg_marquardt(

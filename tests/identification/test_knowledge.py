@@ -164,5 +164,5 @@ def test_tied_and_fixed_parameters_are_known_better() -> None:
 def test_values_out_of_reach_are_refused() -> None:
     rows = measured(1, 24, 8)
     problem = inverse_problem(rows.mechanism, rows.joints, rows.pose, pose_noise=NOISE)
-    with pytest.raises(InputError, match="machine 1: the residual is not finite at the values given"):
+    with pytest.raises(InputError, match="machine 1: the residual is not finite where it is linearised"):
         what_is_known(problem, 0.1 * problem.start)

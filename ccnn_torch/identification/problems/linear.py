@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.problem import Problem
 
 # A direction in which the rows leave more than so many plausible errors open (0.1 m, 0.2 rad) counts as unseen: what a
@@ -109,6 +110,18 @@ class WeightedRows:
         """Weighted residual `r x m x sc` and its Jacobian in u, `r x m x sc x k`; `extra` weights are `r x m x s`."""
         value, slope = self._rows(values, machines, extra)
         return value, slope * self.scale
+
+    def linearised(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """As `jacobian` at one set of values for each machine, `r x k`: `r x sc` and `r x sc x k`.
+
+        Raises:
+            InputError: a residual is not finite there.
+        """
+        everyone = torch.arange(len(values), device=values.device)
+        residual, slope = (part[:, 0] for part in self.jacobian(values[:, None], everyone))
+        for lost in torch.nonzero(~torch.isfinite(residual.sum(-1) + slope.abs().sum((-2, -1)))):
+            raise InputError(f"machine {int(lost) + 1}: the residual is not finite where it is linearised")
+        return residual, slope
 
     def _rows(self, values: Tensor, machines: Tensor, extra: Tensor | None) -> tuple[Tensor, Tensor]:
         """As `jacobian`, but of the values and not of u."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.linear import WeightedRows
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
 
@@ -47,15 +46,11 @@ def l_curve(problem: Problem, values: Tensor) -> LCurve:
         InputError: the residual is not finite there.
     """
     rows = WeightedRows(problem)
-    everyone = torch.arange(len(values), device=values.device)
-    residual, slope = (part[:, 0] for part in rows.jacobian(values[:, None], everyone))
+    residual, slope = rows.linearised(values)
     if rows.has_prior:
         pull = rows.pull.sqrt()
         residual = torch.cat([residual, pull * (values - problem.start) / problem.scale], dim=-1)
         slope = torch.cat([slope, torch.diag(pull).expand(len(values), -1, -1)], dim=-2)
-    lost = torch.nonzero(~(torch.isfinite(residual).all(-1) & torch.isfinite(slope).all(-1).all(-1)))
-    if len(lost):
-        raise InputError(f"machine {int(lost[0]) + 1}: the residual is not finite where it is linearised")
     left, singular, right = torch.linalg.svd(slope, full_matrices=False)
     share = -(left.mT @ residual[..., None])[..., 0]
     beyond = (residual.square().sum(-1) - share.square().sum(-1)).clamp_min(0)
