@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from kinds import KINDS, little, little_arm, masked, six_joints
 from module_graph import to_onnx
+from onnx import numpy_helper
 from structured_text import Instance, parse_blocks
 from torch import Tensor
 
@@ -195,6 +197,14 @@ def test_moments_of_forces_are_in_every_target() -> None:
     session = open_onnx(to_onnx(Cross(), {"a": a, "b": b}, ["found"]).SerializeToString())
     for found in (run_program(program, given)["found"], session.run(None, given)[0]):
         np.testing.assert_allclose(found, np.cross(a, b), rtol=0, atol=1e-15)
+
+
+def test_no_product_of_a_graph_is_nothing() -> None:
+    """Steps of Broyden's method are put side by side and taken apart again."""
+    graph = onnx.load_from_string(export_float32(KINDS["steep"](), "{}")).graph
+    constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    matrices = [constants[node.input[1]] for node in graph.node if node.op_type == "Gemm"]
+    assert len(matrices) > 50 and all(matrix.any() for matrix in matrices)
 
 
 def test_rounding_does_not_grow_in_the_steps_of_single_precision() -> None:
