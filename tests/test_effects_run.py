@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from frozen import frozen
+from module_graph import to_onnx
 from torch import Tensor
 from typer.testing import CliRunner
 
@@ -21,7 +22,6 @@ from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
-from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.compensation.model_files.onnx_session import open_onnx
 from ccnn_torch.compensation.networks import describe_network, network_from_description
 from ccnn_torch.diagnosis.from_file import Verdict, read_verdict
@@ -236,7 +236,7 @@ def test_an_exported_graph_has_the_numbers_of_the_effects() -> None:
         acting.append(Acting(effect, usual(effect, situation), torch.tensor(sizes, dtype=torch.float64)))
     module = expand_effects(situation, acting, [*covariates], 0.1, Care(0.04, 0.0, 2.0, 4.0))
     given = torch.stack([*covariates.values()], -1)
-    model = to_onnx(module, {"joints": joints, "covariates": given}, ["deviation"], 20)
+    model = to_onnx(module, {"joints": joints, "covariates": given}, ["deviation"])
     session = open_onnx(model.SerializeToString())
     found = session.run(None, {"joints": joints.numpy(), "covariates": given.numpy()})[0]
     np.testing.assert_allclose(found, module(joints, given).numpy(), rtol=0, atol=1e-13)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.machine.machine import FARTHEST
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
@@ -51,7 +50,7 @@ class Promise:
 
     @classmethod
     def of_card(cls, facts: Mapping[str, Any]) -> Promise:
-        """Out of facts of the right form (`check_form`)."""
+        """Out of facts of the right form (`read_facts`, `description_of`)."""
         domain, principal = facts["domain"], facts["domain"]["principal"]
         # By name: JSON has its keys in another order.
         edges = [domain["inputs"][c["name"]] for c in facts["joints"] + facts["covariates"]]
@@ -80,16 +79,6 @@ class Promise:
             np.concatenate([(low - centre) / half_range, least]),
             np.concatenate([(high - centre) / half_range, most]),
         )
-
-    @classmethod
-    def of_compensator(cls, compensator: Compensator) -> Promise:
-        """As the card that would be written for it."""
-        domain = compensator.domain
-        middle, radius = domain.middle.numpy(), domain.radius.numpy()
-        centre, low, high = domain.centre.numpy(), domain.low.numpy(), domain.high.numpy()
-        most, sd = compensator.most.numpy(), compensator.fallback_sd.numpy()
-        boxes = domain.half_range.numpy(), domain.directions.numpy(), middle - radius, middle + radius
-        return cls(most, sd, domain.huge.numpy(), centre, low, high, *boxes)
 
     def cleaned(self, inputs: Array) -> tuple[Array, Array]:
         """Finite inputs `s x d` [SI], as a `Domain` makes them, and which were not, `s x d`, bool."""

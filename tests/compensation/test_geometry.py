@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from machines import arm, overconstrained, small_network
+from module_graph import to_onnx
 from torch import Tensor
 
 from ccnn_torch.compensation import (
@@ -17,7 +18,6 @@ from ccnn_torch.compensation import (
     load_model,
     save_model,
 )
-from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
 from ccnn_torch.compensation.model_files.onnx_session import check_graph, open_onnx
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -52,7 +52,7 @@ def fields_of(mechanism: Mechanism) -> dict[str, object]:
 def test_the_deviation_runs_in_onnx_in_double() -> None:
     joints = arm().joints
     module = expand(lambda q: 1e-3 * q * q.roll(1, -1), joints)
-    model = to_onnx(module, {"joints": joints}, ["deviation"], 20)
+    model = to_onnx(module, {"joints": joints}, ["deviation"])
     check_graph(model)
     session = open_onnx(model.SerializeToString())
     (found,) = session.run(None, {session.get_inputs()[0].name: joints.numpy()})

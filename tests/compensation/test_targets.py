@@ -13,16 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from kinds import KINDS, little, little_arm, masked, six_joints
+from module_graph import to_onnx
+from onnx import numpy_helper
 from structured_text import Instance, parse_blocks
 from torch import Tensor
 
 from ccnn_torch import export_model
 from ccnn_torch.compensation import Compensator
 from ccnn_torch.compensation.export.export import export_float32
-from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.compensation.model_files.identified import load_geometry
 from ccnn_torch.compensation.model_files.onnx_session import open_onnx
 from ccnn_torch.compensation.targets import from_graph
@@ -192,9 +194,17 @@ def test_moments_of_forces_are_in_every_target() -> None:
     a, b = torch.rand(2, 1, 3, dtype=torch.float64)
     program = traced_program(Cross(), (a, b), "cross", ("a", "b"), ["found"])
     given = {"a": a.numpy(), "b": b.numpy()}
-    session = open_onnx(to_onnx(Cross(), {"a": a, "b": b}, ["found"], 20).SerializeToString())
+    session = open_onnx(to_onnx(Cross(), {"a": a, "b": b}, ["found"]).SerializeToString())
     for found in (run_program(program, given)["found"], session.run(None, given)[0]):
         np.testing.assert_allclose(found, np.cross(a, b), rtol=0, atol=1e-15)
+
+
+def test_no_product_of_a_graph_is_nothing() -> None:
+    """Steps of Broyden's method are put side by side and taken apart again."""
+    graph = onnx.load_from_string(export_float32(KINDS["steep"](), "{}")).graph
+    constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    matrices = [constants[node.input[1]] for node in graph.node if node.op_type == "Gemm"]
+    assert len(matrices) > 50 and all(matrix.any() for matrix in matrices)
 
 
 def test_rounding_does_not_grow_in_the_steps_of_single_precision() -> None:

@@ -7,9 +7,9 @@ import onnxruntime
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
+from module_graph import to_onnx
 from torch import Tensor
 
-from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.evolution import Genome, MaskedNetwork, alive_nodes, decode, forward, prune
 from ccnn_torch.evolution.network import average, fed_nodes
 
@@ -125,7 +125,7 @@ def test_exports_to_onnx_and_torch_export_with_any_batch(density: float) -> None
     network = MaskedNetwork(masks, weights).eval()
     example = torch.linspace(-1, 1, 12, dtype=torch.float64).view(4, 3)
     shapes = ({0: torch.export.Dim("batch")},)
-    model = to_onnx(network, {"inputs": example}, ["output"], 20)
+    model = to_onnx(network, {"inputs": example}, ["output"])
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     program = torch.export.export(network, (example,), dynamic_shapes=shapes).module()
     for rows in (4, 1, 9):

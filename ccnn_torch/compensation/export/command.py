@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator, status_of
 from ccnn_torch.compensation.export.graph import Graph, Value
-from ccnn_torch.compensation.export.to_onnx import Traced, rows_apart_from
+from ccnn_torch.compensation.export.traced import Traced, rows_apart_from
 from ccnn_torch.compensation.machine.machine import ASTRAY
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
 from ccnn_torch.compensation.routines import Copy, Functions, Statement, routines_of

@@ -264,7 +264,9 @@ class Graph:
         return Linear({}, tensor[0]) if tensor.dim() == 2 and tensor.shape[0] == self.rows else None
 
     def _of_form(self, form: Linear) -> Value:
-        return Value((self.rows, len(form.offset)), form=form)
+        """Without tensors that do not count in it, as one of several that were put side by side and taken apart."""
+        terms = {name: matrix for name, matrix in form.terms.items() if bool(matrix.any())}
+        return Value((self.rows, len(form.offset)), form=Linear(terms, form.offset))
 
     def _sizes(self, shape: Sequence[int]) -> str:
         """A shape with the batch of the call in it."""

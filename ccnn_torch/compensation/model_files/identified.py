@@ -16,7 +16,7 @@ from ccnn_torch.compensation.guard import Promise, as_rows, kept
 from ccnn_torch.compensation.machine.alone import ROWS, all_over, machine_alone
 from ccnn_torch.compensation.model_files.card import MODEL_FORMS, card_of, read_model
 from ccnn_torch.compensation.model_files.load import LoadedModel, load_model, machine_of_model
-from ccnn_torch.compensation.model_files.metadata import from_json
+from ccnn_torch.compensation.model_files.metadata import description_of, from_json
 from ccnn_torch.compensation.model_files.signature import check_signature, sign_content, signature_path
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.effects import Situation, default_gravity
@@ -82,6 +82,10 @@ class IdentifiedGeometry:
         except (InputError, MethodFailedError) as reason:
             raise ModelFileError(f"{self.path}: {reason}") from None
 
+    @cached_property
+    def _promise(self) -> Promise:
+        return Promise.of_card(description_of(self.compensator))
+
     @property
     def region(self) -> Array:
         """Lowest and highest joints measured, or of the workspace where that is not known, `n x 2` [SI]."""
@@ -115,7 +119,7 @@ class IdentifiedGeometry:
         compensator, given = self.compensator, None if flat is None else torch.tensor(flat)
         with torch.no_grad():
             found = {k: v.numpy() for k, v in compensator.solve(torch.tensor(rows), given)._asdict().items()}
-        checked = kept(found, rows, flat, Promise.of_compensator(compensator))
+        checked = kept(found, rows, flat, self._promise)
         del checked["deviation_sd"]
         return {name: value.reshape((*lead, *value.shape[1:])) for name, value in checked.items()}
 

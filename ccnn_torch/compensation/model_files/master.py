@@ -15,8 +15,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.domain import Domain
-from ccnn_torch.compensation.model_files.metadata import check_keys, check_tensors, coordinates, from_json, to_json
-from ccnn_torch.compensation.model_files.metadata_form import check_form
+from ccnn_torch.compensation.model_files.metadata import check_tensors, coordinates, from_json, read_facts
 from ccnn_torch.compensation.model_files.onnx_session import (
     METADATA_KEY,
     OUTPUTS,
@@ -48,18 +47,6 @@ def open_model(path: Path, content: bytes) -> tuple[dict[str, Any], Run, Compens
     return facts, lambda joints, covariates: run_onnx(session, joints, covariates), None
 
 
-def _facts(text: Any) -> dict[str, Any]:
-    try:
-        facts = check_keys(from_json(text or "null"))
-    except ValueError:
-        raise ModelFileError("its metadata is not JSON" + TAKE_AGAIN) from None
-    # Two texts can mean one number (long decimals do), so the text itself must be the one we would write.
-    if to_json(facts) != text:
-        raise ModelFileError("its metadata was edited after it was written")
-    check_form(facts)
-    return facts
-
-
 def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
     try:
         tensors = load_tensors(content)
@@ -67,7 +54,7 @@ def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
         header = from_json(content[8 : 8 + int.from_bytes(content[:8], "little")])
     except (SafetensorError, ValueError, KeyError):
         raise ModelFileError("it is damaged, or no safetensors file" + TAKE_AGAIN) from None
-    facts = _facts(header.get("__metadata__", {}).get(METADATA_KEY))
+    facts = read_facts(header.get("__metadata__", {}).get(METADATA_KEY))
     try:
         check_tensors(facts, tensors)
         compensator = _rebuild(facts, tensors)
@@ -87,7 +74,7 @@ def _open_onnx(content: bytes) -> tuple[dict[str, Any], Any]:
         model = onnx.load_from_string(content)
     except DecodeError:
         raise ModelFileError("it is damaged, or no ONNX file" + TAKE_AGAIN) from None
-    facts = _facts({entry.key: entry.value for entry in model.metadata_props}.get(METADATA_KEY))
+    facts = read_facts({entry.key: entry.value for entry in model.metadata_props}.get(METADATA_KEY))
     if any(i.type.tensor_type.elem_type == onnx.TensorProto.FLOAT for i in model.graph.input):
         raise ModelFileError(
             "this is the single precision variant for controllers, which gives one row's deviation; use the .onnx "

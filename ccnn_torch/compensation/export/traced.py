@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from itertools import count
 from typing import Any
 
-import onnx
 import torch
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
@@ -25,25 +24,6 @@ def rows_apart_from(module: torch.nn.Module) -> int:
     lengths = {n for tensor in tensors for n in tensor.shape if n}
     primes = (p for p in count(_LEAST) if all(p % d for d in range(2, math.isqrt(p) + 1)))
     return next(p for p in primes if all(n % p for n in lengths))
-
-
-def to_onnx(
-    module: torch.nn.Module, inputs: Mapping[str, Tensor], outputs: Sequence[str], opset: int
-) -> onnx.ModelProto:
-    """A module of its own as an ONNX graph in double; command paths are made by `command_graph`.
-
-    Args:
-        module: takes tensors `s x w`, returns tensors of as many rows.
-        inputs: name -> a row for an example, `1 x w` or more.
-
-    Raises:
-        MethodFailedError: there is an operation that no file has.
-    """
-    rows = rows_apart_from(module)
-    graph = Graph(rows, opset)
-    given = [graph.input(name, row.shape[1], "batch") for name, row in inputs.items()]
-    found = Traced(module, *(row[:1].repeat(rows, 1) for row in inputs.values()))(graph, *given)
-    return graph.model(dict(zip(outputs, found, strict=True)), "batch", "module")
 
 
 class Traced:
