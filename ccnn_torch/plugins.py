@@ -94,6 +94,17 @@ def failure(error: BaseException, label: str) -> str:
     return f"fails{where}: {type(error).__name__}{': ' if text else ''}{text}"
 
 
+@contextmanager
+def users_code(label: str, call: str = "") -> Iterator[None]:
+    """Within it anything that a user's code raises becomes an InputError: `LABEL: CALL fails at line N: …`."""
+    try:
+        yield
+    except CcnnError:
+        raise
+    except (Exception, SystemExit) as error:  # a user's code may raise anything
+        raise InputError(f"{label}: {call}{failure(error, label)}") from error
+
+
 def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
     """Run the file and return what it calls `Name`: something that can be called, or an object of a class of `also`.
 
@@ -119,17 +130,13 @@ def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
         raise InputError(f"{spec}: {file} is no Python file")
     module = importlib.util.module_from_spec(module_spec)
     sys.modules[unique] = module
-    try:
-        module_spec.loader.exec_module(module)
-    except SyntaxError as error:
-        raise InputError(f"{spec}: {file} line {error.lineno} is no valid Python: {error.msg}") from error
-    except ImportError as error:
-        raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
-    except CcnnError:
-        raise
-    # A user's code may raise any exception.
-    except (Exception, SystemExit) as error:
-        raise InputError(f"{spec}: {file} {failure(error, spec)}") from error
+    with users_code(spec, f"{file} "):
+        try:
+            module_spec.loader.exec_module(module)
+        except SyntaxError as error:
+            raise InputError(f"{spec}: {file} line {error.lineno} is no valid Python: {error.msg}") from error
+        except ImportError as error:
+            raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
     found = getattr(module, name, None)
     if not callable(found) and not isinstance(found, also):
         classes = [n for n, o in vars(module).items() if inspect.isclass(o) and o.__module__ == module.__name__]

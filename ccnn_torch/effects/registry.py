@@ -21,10 +21,10 @@ from ccnn_torch.effects.loads import Compliance, Gravity
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.effects.time import Drift, Latency, Thermal
-from ccnn_torch.errors import CcnnError, InputError
+from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.batching import leading_shape
-from ccnn_torch.plugins import class_hint, failure, is_plugin, load_plugin
+from ccnn_torch.plugins import class_hint, is_plugin, load_plugin, users_code
 from ccnn_torch.units import to_si
 
 _Part = TypeVar("_Part", Coefficient, Shape)
@@ -94,11 +94,13 @@ class OwnEffect:
 
     def _asked(self, verb: str, *given: object) -> Any:
         try:
-            return getattr(self.own, verb)(*given)
-        except CcnnError:
-            raise
-        except (Exception, SystemExit) as error:  # a user's code may raise anything
-            raise InputError(f"{self.label}: {verb}() {failure(error, self.label)}{_hint(error, given[0])}") from error
+            with users_code(self.label, f"{verb}() "):
+                return getattr(self.own, verb)(*given)
+        except InputError as error:
+            hint = _hint(error.__cause__, given[0])
+            if not hint:
+                raise
+            raise InputError(f"{error}{hint}") from error.__cause__
 
     def _listed(self, verb: str, kind: type[_Part], situation: Situation) -> tuple[_Part, ...]:
         found = self._asked(verb, situation)
@@ -203,7 +205,7 @@ def _a(value: object) -> str:
     return f"a {kind.__name__}" if kind.__module__ == "builtins" else f"a {kind.__module__}.{kind.__name__}"
 
 
-def _hint(error: BaseException, given: object) -> str:
+def _hint(error: BaseException | None, given: object) -> str:
     """A column that is not there is what mostly lacks of a mapping by name."""
     if not (isinstance(error, KeyError) and isinstance(given, Situation)):
         return ""
@@ -362,12 +364,8 @@ def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
     """
     if is_plugin(name):
         make = load_plugin(name)
-        try:
+        with users_code(name, "making it without arguments "):
             effect = make()
-        except CcnnError:
-            raise
-        except (Exception, SystemExit) as error:  # a user's code may raise anything
-            raise InputError(f"{name}: making it without arguments {failure(error, name)}") from error
         return owned(effect, name)
     if Path(name).suffix == ".py":
         raise InputError(f"effects: {class_hint(name)}")

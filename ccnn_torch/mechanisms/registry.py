@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
-import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.errors import CcnnError, InputError
+from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.files.dh_file import read_dh_file, read_urdf
 from ccnn_torch.mechanisms.files.mechanism_file import MechanismFile, read_mechanism_file
 from ccnn_torch.mechanisms.frames.framed import Framed
@@ -26,7 +25,7 @@ from ccnn_torch.mechanisms.machines.stewart import Stewart
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
-from ccnn_torch.plugins import class_hint, code_refused, file_that_names, is_plugin, load_plugin
+from ccnn_torch.plugins import class_hint, code_refused, file_that_names, is_plugin, load_plugin, users_code
 
 _POSES, _STEPS = 256, 8
 # A walk whose joints change by more than this in a step, or that differs by less from the direct answer, is not
@@ -104,7 +103,7 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
     Home joints that are only near those of the home pose are settled first; numeric inverse kinematics are then held
     against a walk through the sampling box, which must not end on another branch.
     """
-    try:
+    with users_code(spec):
         mechanism = make()
         if isinstance(mechanism, Simulator):
             mechanism = BlackBox(mechanism)
@@ -116,11 +115,6 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
         if not wrong:
             settle_home(mechanism)
             wrong = _wrong_kinematics(mechanism) or jump_sentence(mechanism)
-    except CcnnError:
-        raise
-    except (Exception, SystemExit) as error:  # a user's code may raise anything
-        said = str(error).strip().splitlines() or [""]
-        raise InputError(f"{spec}{_line(spec, error)}: {type(error).__name__}: {said[0]}") from error
     if wrong:
         raise InputError(f"{spec}: {wrong}; {_ADVICE}")
     return mechanism
@@ -183,13 +177,6 @@ def _wrong_kinematics(m: Mechanism) -> str:
     if not off <= _CLOSES:
         return f"forward_kinematics of the home pose's joints misses it by {off:.2g}"
     return ""
-
-
-def _line(spec: str, error: BaseException) -> str:
-    """` line N` of the innermost call in the user's file."""
-    file = spec.rpartition(":")[0]
-    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename.endswith(file)]
-    return f" line {lines[-1]}" if lines else ""
 
 
 def _framed(

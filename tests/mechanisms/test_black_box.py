@@ -200,7 +200,7 @@ def _islands(commands: np.ndarray, covariates: object, parameters: np.ndarray) -
         ({"simulate": lambda c, *o: c * 0}, "no joint changes the pose"),
         ({"simulate": _noisy}, "not deterministic: evaluated twice at q1 = .*seed its random numbers"),
         ({"simulate": _coupled}, "not deterministic.*let no row depend on others"),
-        ({"simulate": _failing}, r"simulate fails at line \d+ of .*test_black_box.py on 1 row: ValueError: operands"),
+        ({"simulate": _failing}, r"simulate on 1 row fails at line \d+ of .*test_black_box.py: ValueError: operands"),
         ({"pose": ("x", "theta")}, "pose: 'theta' is none of x, y, z.*frame"),
         ({"pose": ("x", "phi")}, "phi needs two of x, y, z"),
         ({"covariates": ("payload",)}, r"'payload' is none of load_x.*Condition\(name, unit"),

@@ -141,11 +141,11 @@ _FORWARD = "\n    def forward_kinematics(self, joints, parameters=None, guess=No
         ),
         ({"geometry": '[Parameter("d", "m", 0.1, 3)]'}, "'d' belongs to leg 3; legs are numbered from 1 to 1"),
         ({"box": "(1.0,), (0.0,)"}, "low and high need 1 numbers each, low below high"),
-        ({"call": "len"}, "own.py:Slide line 8: TypeError"),
+        ({"call": "len"}, "own.py:Slide: fails at line 8: TypeError"),
         ({"inverse": "pose - self.nominal"}, r"gives shape \(3, 1\) for 3 poses and 2 sets of parameters"),
         (
             {"inverse": "pose - self.resolve(parameters).length"},
-            "own.py:Slide line 11: AttributeError: .* no attribute",
+            "own.py:Slide: fails at line 11: AttributeError: .* no attribute",
         ),
         ({"inverse": "torch.sqrt(self.resolve(parameters) - 1 - pose)"}, "its home pose has no joints"),
         ({"inverse": "(pose - self.resolve(parameters)).float()"}, "gives torch.float32, expected torch.float64"),

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +16,9 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter, plausible_error
 from ccnn_torch.display import count_text
-from ccnn_torch.errors import CcnnError, InputError
+from ccnn_torch.errors import InputError
 from ccnn_torch.numerics.batching import leading_shape
+from ccnn_torch.plugins import users_code
 
 Simulate = Callable[[Any, dict[str, Any], Any], Any]
 """`(commands N x n, {name: N}, parameters N x k) -> pose N x p`, all in SI, every row independently."""
@@ -212,7 +211,6 @@ def try_simulator(simulator: Simulator, calls: Calls, home: Tensor, joints: Tens
 _AT_MOST, _AT_ONCE = 50_000, 512
 # Rows that are kept.
 _MOST_KEPT = 500_000
-_PACKAGE = str(Path(__file__).parents[1])
 _WATCHER: ContextVar[Callable[[int], None] | None] = ContextVar("watcher", default=None)
 
 
@@ -298,7 +296,7 @@ class Calls:
         # Copies: a simulator that writes into what it is given must not change what it is compared with.
         commands, parameters = rows[:, :n].copy(), rows[:, n + len(names) :].copy()
         covariates = {name: rows[:, n + i].copy() for i, name in enumerate(names)}
-        try:
+        with users_code(f"simulator '{simulator.name}'", f"simulate on {count_text(len(rows), 'row')} "):
             if simulator.tensors:
                 tensors = {name: torch.from_numpy(value) for name, value in covariates.items()}
                 answer = simulator.simulate(torch.from_numpy(commands), tensors, torch.from_numpy(parameters))
@@ -306,14 +304,6 @@ class Calls:
                 answer = simulator.simulate(commands, covariates, parameters)
             plain = answer.detach().numpy() if isinstance(answer, Tensor) else answer
             pose = np.array(plain, dtype=np.float64)
-        except CcnnError:
-            raise
-        except (Exception, SystemExit) as error:  # a user's code may raise anything
-            said = (str(error).strip().splitlines() or [""])[0]
-            raise InputError(
-                f"simulator '{simulator.name}': simulate fails{_line(error)} on {count_text(len(rows), 'row')}: "
-                f"{type(error).__name__}: {said}"
-            ) from error
         wanted = (len(rows), len(simulator.pose))
         if pose.shape != wanted:
             raise InputError(
@@ -334,10 +324,3 @@ def described(simulator: Simulator, joints: Tensor, conditions: Mapping[str, Ten
 
 def _names(simulator: Simulator) -> str:
     return ", ".join(c if isinstance(c, str) else c.name for c in simulator.pose)
-
-
-def _line(error: BaseException) -> str:
-    """` at line N of FILE`, of the innermost call outside this package and others."""
-    frames = traceback.extract_tb(error.__traceback__)
-    users = [f for f in frames if "site-packages" not in f.filename and not f.filename.startswith(_PACKAGE)]
-    return f" at line {users[-1].lineno} of {users[-1].filename}" if users else ""
