@@ -11,8 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.hyperparameters import Scales
-from ccnn_torch.evidence.marginal_likelihood import Grams
+from ccnn_torch.evidence.marginal_likelihood import Grams, Scales
 
 _DIGITS = 1e-13
 

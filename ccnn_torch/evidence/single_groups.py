@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.hyperparameters import FIRST_NOISE, LIMIT, SPREAD, Scales
+from ccnn_torch.evidence.marginal_likelihood import FIRST_NOISE, LIMIT, SPREAD, Scales
 
 _UPDATES = 8
 # Principal axes with less than this share of the largest one's squares are rounding.

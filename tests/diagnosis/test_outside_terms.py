@@ -12,7 +12,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.diagnosis.residual.noise_evidence import noise_of_repeats
 from ccnn_torch.effects import Situation
-from ccnn_torch.evidence.beside import gain_beside
+from ccnn_torch.evidence.dictionary import gain_beside
 from ccnn_torch.evidence.single_groups import NO_COLUMNS, fit_single_groups, own_products
 
 

@@ -271,7 +271,7 @@ def test_a_gain_is_told_as_a_share_of_that_of_the_model(tmp_path: Path) -> None:
 
 
 def test_a_derivative_gain_is_told_in_seconds_over_the_proportional_one(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", derivative=0.02)
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, derivative=0.02)
     found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), ["servo_gain", "delay", "viscous"])
     assert found.content["verdict"]["effects"] == ["servo_gain"]
     assert found.content["verdict"]["probability"] > 0.95
@@ -281,7 +281,7 @@ def test_a_derivative_gain_is_told_in_seconds_over_the_proportional_one(tmp_path
 
 
 def test_integral_action_is_named_with_its_integral_gain(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", integral=2.0, weight=0.3)
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, integral=2.0, weight=0.3)
     nominal = nominal_of("servo", KEYS | {"gravity_sin": 0.3}, ["rad"])
     tried = ["integral_action", "servo_gain", "viscous", "gravity", "cogging"]
     found = diagnose_motion(load_logs([log]), nominal, tried)

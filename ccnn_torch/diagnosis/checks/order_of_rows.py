@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis.search.shared_noise import without_fitted
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Situation
 from ccnn_torch.effects.backlash import Backlash
-from ccnn_torch.evidence.beside import gain_beside
+from ccnn_torch.evidence.dictionary import gain_beside
 
 # Log odds that the directions must gain beside the verdict, and beyond twice what those of as many random orders gain:
 # in any order a row far out was reached from further in, so that directions follow the place a little.

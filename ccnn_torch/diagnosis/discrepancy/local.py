@@ -7,7 +7,7 @@ place alone. So that place is searched, and the search is charged as that for a 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -16,8 +16,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
 from ccnn_torch.diagnosis.discrepancy.interaction import interaction_discrepancies
-from ccnn_torch.diagnosis.discrepancy.jump import jump_discrepancies
-from ccnn_torch.diagnosis.discrepancy.periodic import periodic_discrepancy
 from ccnn_torch.diagnosis.discrepancy.smooth import joint_moves, platform_moves, spread_out, unit_range
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Situation
@@ -40,6 +38,13 @@ _BELIEVED = 20.0
 _LOOSE = 10.0
 # A platform turns where its rotation matrix changes by this.
 _TURNS = 1e-6
+# Periods in the time of the rows: from where the waves of any course end, to so many rows a period, or so many in all.
+_SLOWEST, _ROWS_A_PERIOD, _MOST = 8.0, 3.0, 130.0
+_PERIOD_STEP = 1 / 3
+# Values between the neighbours of the best, so often.
+_FINE, _ROUNDS = 9, 3
+# Rows before the first possible jump and after the last, and places that are tried, at most.
+_FEWEST_ROWS, _PLACES = 5, 120
 
 
 def local_discrepancies(
@@ -156,3 +161,87 @@ def _searched(points: Tensor, places: Tensor, lead: Tensor, left: NuisanceFit, t
         reached = torch.maximum(most, reached)
     charge = torch.tensor([search_charge(times * s) for s in score], dtype=score.dtype)
     return torch.where(reached[:, None] > -torch.inf, place, torch.nan), charge
+
+
+def periodic_discrepancy(time: Tensor, raw: Tensor, lead: Tensor, few: Tensor, left: NuisanceFit) -> list[Atom]:
+    """The sine of time that explains most, its search charged, with its period in its `note`; none where there are too
+    few rows for any.
+
+    Args:
+        time: of each row, `s` [s].
+        raw: shifts and turns of the platform, `s x c0 x k` [m, rad].
+        lead: the same whitened, `s x c x k`.
+        few: rows evaluated, `t`.
+        left: what is to be explained there.
+    """
+    span = float(time.max() - time.min())
+    fastest = min(len(time) / _ROWS_A_PERIOD, _MOST)
+    if span <= 0 or fastest < _SLOWEST + 1:
+        return []
+    share = (time - time.min()) / span
+    looked_at = SharedColumns(lead[few])
+
+    def gain(periods: Tensor) -> Tensor:
+        return left.gain(TrialColumns(_waves(share[few], periods)[:, :, None], looked_at))
+
+    grid = torch.arange(_SLOWEST, fastest, _PERIOD_STEP, dtype=time.dtype)
+    score = gain(grid)
+    best, reached, step = grid[score.argmax()], float(score.max()), _PERIOD_STEP
+    for _ in range(_ROUNDS):
+        close = best + step * torch.linspace(-1, 1, _FINE, dtype=time.dtype)
+        finer = gain(close)
+        if float(finer.max()) > reached:
+            best, reached = close[finer.argmax()], float(finer.max())
+        step *= 2 / (_FINE - 1)
+    charge = search_charge(len(lead) / len(few) * score)
+    columns = (raw[..., None] * _waves(share, best[None])[0][:, None, None]).flatten(-2)
+    note = f"what follows the time is a sway with a period of {span / float(best):.3g} s"
+    return [Atom("time", None, columns.new_zeros(0), columns, OUTSIDE - charge, note=note)]
+
+
+def _waves(share: Tensor, periods: Tensor) -> Tensor:
+    """Sine and cosine, `g x s x 2`; share: of the time, `s`; periods in all of it, `g`."""
+    angle = 2 * math.pi * share * periods[:, None]
+    return torch.stack([torch.sin(angle), torch.cos(angle)], -1)
+
+
+def jump_discrepancies(
+    moved: Mapping[str, Tensor], whitened: Mapping[str, Tensor], few: Tensor, plain: NuisanceFit, loose: float
+) -> list[Atom]:
+    """The likeliest jump of everything that may have moved, its search charged; `note` says what moved.
+
+    Args:
+        moved: what may have moved -> columns of a shift of it, `s x c0 x k` [m, rad]; rows in the order measured.
+        whitened: the same, `s x c x k`.
+        few: rows evaluated, `t`.
+        plain: what is to be explained there.
+        loose: size of what else is there, in plausible sizes.
+    """
+    rows = len(next(iter(moved.values())))
+    if rows < 4 * _FEWEST_ROWS:
+        return []
+    step = max(1, -(-(rows - 2 * _FEWEST_ROWS) // _PLACES))
+    number = torch.arange(rows)
+    found = []
+    for what, columns in moved.items():
+        lead = whitened[what][few]
+        shared, left = SharedColumns(lead), plain.beside(loose * lead)
+
+        def gain(places: Tensor, shared: SharedColumns = shared, left: NuisanceFit = left) -> Tensor:
+            return left.gain(TrialColumns(_steps(number[few], places)[..., None, None], shared))
+
+        places = torch.arange(_FEWEST_ROWS, rows - _FEWEST_ROWS, step)
+        score = gain(places)
+        best = int(places[score.argmax()])
+        close = torch.arange(max(best - step + 1, _FEWEST_ROWS), min(best + step, rows - _FEWEST_ROWS))
+        best = int(close[gain(close).argmax()])
+        charge = search_charge(rows / len(few) * score)
+        acting = columns * _steps(number, torch.tensor([best]))[0][:, None, None]
+        prior = OUTSIDE - charge
+        found.append(Atom("time", None, lead.new_zeros(0), acting, prior, note=f"a jump of {what}", begins=best))
+    return found
+
+
+def _steps(number: Tensor, places: Tensor) -> Tensor:
+    """0 before each place and 1 from it on, `g x s`."""
+    return (number >= places[:, None]).to(torch.float64)

@@ -6,17 +6,26 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ccnn_torch.diagnosis.discrepancy.smooth import ANY
+import torch
+
+from ccnn_torch.diagnosis.discrepancy.smooth import ANY, joint_moves
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.verdict.borrowed import borrowed_names
-from ccnn_torch.evidence.beside import gain_beside
-from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.effects import pose_residual
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, gain_beside
 from ccnn_torch.evidence.form_error import Posterior, is_unexplained, with_form_error
 from ccnn_torch.evidence.judge import Explanation, judge, marginal, posterior
 from ccnn_torch.evidence.sets import scored
 
 # Log odds against the most probable set beyond which sets are not considered.
 _FAR = 12.0
+# Share of an effect's own squares that must not be borrowed from what other effects do.
+_OWN = 0.1
+# Or that must come from other coefficients than those that mend its form, where these are so many times as large, in
+# plausible sizes.
+_MAIN, _MENDED = 0.5, 15.0
+# Plausible sizes that no cause has on a machine of usual quality: sealed machines whose gap was 30 times the noise had
+# up to 185; a unit mistaken makes 1000.
+_IMPLAUSIBLE = 250.0
 
 
 @dataclass(frozen=True)
@@ -161,3 +170,44 @@ def _second_driver(analysis: Analysis, posterior: Posterior, found: FittedSet) -
     gains = gain_beside(dictionary, known, [analysis.outside[i] / size for i in more], analysis.y / size)
     odds, best = max((gain + atoms[i].log_prior, i) for gain, i in zip(gains, more, strict=True))
     return (atoms[best].name,) if odds > 0 else ()
+
+
+def borrowed_names(analysis: Analysis, posterior: Posterior, found: FittedSet) -> frozenset[str]:
+    """Names of a set that rest on what other effects do as well, or on what should only correct their form, or that
+    would be of a size beside others that no cause has."""
+    dictionary, names, most = posterior.dictionary, set(), implausible_size(analysis)
+    for i, mean in zip(found.members, found.mean, strict=True):
+        atom, group = analysis.atoms[i], dictionary.groups[i]
+        if atom.is_discrepancy:
+            continue
+        coefficients = atom.coefficients(analysis.situation)
+        main_sizes = [abs(float(v)) for c, v in zip(coefficients, mean, strict=True) if not c.secondary]
+        if len(found.members) > 1 and max(main_sizes, default=0.0) > most:
+            names.add(atom.name)
+            continue
+        if not any(c.borrowed or c.mends for c in coefficients):
+            continue
+        borrowed, corrections = (
+            torch.tensor(flags, dtype=torch.bool)
+            for flags in zip(*((c.borrowed, c.mends) for c in coefficients), strict=True)
+        )
+        gram = dictionary.grams.xx[group][:, group]
+        parts = (mean * ~borrowed, mean * ~corrections, mean)
+        alone, main, whole = (float(m @ gram @ m) for m in parts)
+        largest, mended = (float((mean * kind).abs().max()) for kind in (~corrections, corrections))
+        if alone < _OWN * whole or (main < _MAIN * whole and mended > _MENDED * largest):
+            names.add(atom.name)
+    return frozenset(names)
+
+
+def implausible_size(analysis: Analysis) -> float:
+    """Size beyond which no cause is believed, in plausible sizes: the more, the worse the machine is as a whole.
+
+    A machine's scale is the root mean square of its gap over that of what its joints make when each of them is off by
+    as much as is to be expected; at least 1.
+    """
+    white, situation = analysis.whitening, analysis.situation
+    rows, channels = white.keep(), [c for c in white.channels.tolist() if c < 3] or white.channels.tolist()
+    gap = pose_residual(situation, analysis.measured)[rows][:, channels].square().mean()
+    usual = joint_moves(situation, situation.jacobian)[rows][:, channels].square().sum(-1).mean()
+    return _IMPLAUSIBLE * max(1.0, float((gap / usual.clamp_min(1e-300)).sqrt()))
