@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, Self, TypeVar
 
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, WriteError
 from ccnn_torch.report.screen import note
 from ccnn_torch.run_folder.folder import LOCK, RunFolder
 from ccnn_torch.training import load_checkpoint
@@ -68,6 +68,8 @@ class FolderJob(Generic[_Config, _Data]):
             folder.write("config.yaml", config.to_yaml(folder.path))
             try:
                 self.compute(config, data, folder, quiet, tables)
+            except WriteError:
+                raise
             except InputError:
                 # Nothing was computed: the next try may take the same name.
                 if {file.name for file in folder.path.rglob("*") if file.is_file()} <= {LOCK, folder.config.name}:

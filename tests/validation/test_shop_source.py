@@ -70,4 +70,4 @@ def test_a_verdict_without_its_unsure_second_name_is_as_likely_as_its_first(tmp_
     assert found.verdict["effects"] == ["instrument"]
     # Which of several small corrections of its form goes with it is not known; none of them is named.
     best = found.judgement.leading[0]
-    assert best[0] > {"instrument"} and best[2] < 0.9 and found.verdict["probability"] == pytest.approx(0.9)
+    assert best.names > {"instrument"} and best.probability < 0.9 and found.verdict["probability"] == pytest.approx(0.9)

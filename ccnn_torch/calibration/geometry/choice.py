@@ -26,8 +26,8 @@ from ccnn_torch.records.splits import Split, fold_splits
 from ccnn_torch.report.results.run import Geometry
 
 _FOLDS = 5
-# Standard errors of the folds' differences by which a larger model has to be better: one is exceeded by chance in every
-# fifth comparison of five folds, two in every seventeenth (Student's t).
+# Standard errors over the folds by which the logarithm of a larger model's error has to be better: one is exceeded by
+# chance in every fifth comparison of five folds, two in every seventeenth (Student's t).
 _ERRORS = 2.0
 # Rows that the comparison uses: enough to see what helps, few enough to take seconds.
 _MOST_ROWS = 600
@@ -224,7 +224,7 @@ def _learned(
 
 
 def simplest_of_best(errors: dict[Candidate, Tensor], asked: str) -> ModelChoice:
-    """The simplest that none of the later ones beats by more than two standard errors of the folds' differences.
+    """The simplest that none of the later ones beats by more than two standard errors over the folds.
 
     Args:
         errors: mean squared pose error by fold, `k` [m²], by candidate, the simplest first.
@@ -232,7 +232,8 @@ def simplest_of_best(errors: dict[Candidate, Tensor], asked: str) -> ModelChoice
     """
     chosen, *others = errors
     for other in others:
-        gain = errors[chosen] - errors[other]
+        # By ratio: a fold with a row near a singular pose errs many times as much as the others in both.
+        gain = torch.log(errors[chosen] / errors[other])
         if float(gain.mean()) > _ERRORS * float(gain.std()) / math.sqrt(len(gain)):
             chosen = other
     said = ", ".join(f"{c.words} {1e3 * math.sqrt(float(e.mean())):.3g} mm" for c, e in errors.items())
