@@ -103,10 +103,14 @@ def judge(
         most = BESIDE_UNKNOWN if chosen.names else 1.0
         return Verdict(chosen, classes, min(unknown, most), outside, drivers)
     if not is_explained(chosen):
-        # A set with a discrepancy term that does explain the data goes before one that does not.
-        other = next((e for e in explanations if e.drivers and is_explained(e)), None)
-        drivers = next((e.drivers for e in ([other] if other else explanations) if e.drivers), ())
-        return Verdict(other or chosen, {}, BESIDE_UNKNOWN, True, drivers)
+        # A set with a discrepancy term that does explain the data goes before one that does not. Where none does, what
+        # is only sure as one of a class is not named: the unknown cause can look like all of it.
+        beside = [e for e in explanations if e.drivers]
+        certain = frozenset(n for n in chosen.names if marginal(explanations, n) >= NAMED)
+        same_names = (e for e in [*beside, *explanations] if e.names == certain)
+        other = next((e for e in beside if is_explained(e)), None) or next(same_names, chosen)
+        drivers = other.drivers or next((e.drivers for e in beside), ())
+        return Verdict(other, {}, BESIDE_UNKNOWN, True, drivers)
     inside = [e for e in explanations if not e.drivers]
     same = sum(e.probability for e in inside if is_same(e.names, chosen.names, classes))
     if chosen.names < likely:
