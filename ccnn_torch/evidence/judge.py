@@ -12,7 +12,7 @@ S = TypeVar("S")
 ODDS = 20.0
 """Odds up to which the data do not distinguish one name from another."""
 NAMED = 0.9
-"""Probability from which a member of the most probable set is named, where the set without it is probable, too."""
+"""Probability from which a member of the most probable set is named, where the set without it was found, too."""
 OUTSIDE = 0.5
 """Probability above which something is said to be outside the library."""
 BESIDE_UNKNOWN = 0.6
@@ -82,6 +82,7 @@ def judge(
     explanations: Sequence[Explanation[S]],
     every: Sequence[Explanation[S]],
     is_explained: Callable[[Explanation[S]], bool] = lambda _: True,
+    of_classes: bool = False,
 ) -> Verdict[S]:
     """The verdict.
 
@@ -89,14 +90,17 @@ def judge(
         explanations: of `posterior`; one of them has no driver.
         every: the same with those that are no candidates for a verdict, but can be mistaken for one.
         is_explained: whether a set of the explanation leaves no more than the noise and its form errors.
+        of_classes: whether a name stays that is only sure as one of its class, unless the set without it is probable:
+            where names have few forms. Where they have many, the class holds what corrects the form of another name.
     """
     unknown = sum(e.probability for e in explanations if e.drivers)
     outside = unknown > OUTSIDE
     chosen = next(e for e in explanations if bool(e.drivers) == outside)
     likely, classes = chosen.names, {} if outside else _classes(every, chosen.names)
-    sure = frozenset(n for n in likely if marginal(explanations, n, *classes.get(n, ())) >= NAMED)
+    like = classes if of_classes else {}
+    sure = frozenset(n for n in likely if marginal(explanations, n, *like.get(n, ())) >= NAMED)
     fewer = next((e for e in explanations if e.names == sure and bool(e.drivers) == outside), chosen)
-    if (sure or outside) and fewer.probability * ODDS > chosen.probability:
+    if (sure or outside) and (not of_classes or fewer.probability * ODDS > chosen.probability):
         chosen, classes = fewer, {} if outside else _classes(every, fewer.names)
     drivers = chosen.drivers
     if outside:

@@ -82,7 +82,7 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
         weighed_sets = [(*name, w, one) for name, w, one in zip(named, weights, sets, strict=True)]
         levels.append((1 / len(LEVELS), weighed_sets))
     explanations = posterior(levels)
-    verdict = judge(explanations, explanations)
+    verdict = judge(explanations, explanations, of_classes=True)
     best, hidden = by_members[verdict.chosen.best.key[0]], None
     probability = verdict.probability
     if verdict.outside and not holds(problem, verdict.chosen.best):
