@@ -61,7 +61,12 @@ def _poses(path: str) -> None:
 
 
 def _nominal(path: str) -> None:
-    mujoco_nominal(path, {}, ["rad"])
+    """And the motion that it makes of a short command."""
+    time = np.arange(0, 0.2, 0.01)
+    loaded = mujoco_nominal(path, {}, ["rad"]).loaded
+    assert loaded is not None
+    found = loaded(time, command(0, time)[:, None], None)
+    assert all(np.isfinite(part).all() for part in found)
 
 
 def _log() -> list[list[str]]:
