@@ -44,20 +44,20 @@ class Vectors:
             names: of outputs; all when empty.
         """
         rows = len(found["command"])
-        eps = 4 * np.finfo(found["command"].dtype).eps
         worst = {}
         for name in names or self.outputs:
             wanted = self.outputs[name][:rows]
             if wanted.dtype.kind in "bi":
                 worst[name] = np.inf if (found[name] != wanted).any() else 0.0
                 continue
-            extra = {"deviation": 0.0, "sd": self.relative, "deviation_sd": self.relative}.get(name, eps)
-            apart = np.abs(found[name].astype(float) - wanted)
+            size = np.abs(wanted)
+            own = {"deviation": 0.0, "sd": self.relative * size, "deviation_sd": self.relative * size}
+            rounding = own[name] if name in own else 2 * np.spacing(size.astype(found["command"].dtype))
             state = self.outputs["ideal_status" if name == "ideal" else "status"][:rows]
-            apart = apart / np.where(state == DAMPED, DAMPED_TOLERANCE, 1.0)[:, None]
+            times = np.where(state == DAMPED, DAMPED_TOLERANCE, 1.0)[:, None]
             # A number that is none is wrong; a joint without deviations has no tolerance.
-            share = np.nan_to_num(apart / (self.tolerance + extra * np.abs(wanted) + 1e-300), nan=np.inf)
-            worst[name] = float(share.max())
+            share = np.abs(found[name].astype(float) - wanted) / (times * self.tolerance + rounding + 1e-300)
+            worst[name] = float(np.nan_to_num(share, nan=np.inf).max())
         return worst
 
 

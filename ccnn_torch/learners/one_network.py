@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 from torch import Tensor
 
 from ccnn_torch.evolution.masked_network import MaskedNetwork
@@ -10,14 +12,14 @@ from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
 from ccnn_torch.learners.protocol import TrainingData
 
 
-class OneNetwork:
+class OneNetwork(ABC):
     """Predictions and networks of a learner that has the data and says its model."""
 
     _data: TrainingData
 
+    @abstractmethod
     def _model(self) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of the model, one a layer, `r x 1 x ...`."""
-        raise NotImplementedError
 
     def predict(self, inputs: Tensor) -> Tensor:
         """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""

@@ -37,11 +37,11 @@ class Study:
 
 
 Write = Callable[[Study, Mapping[str, RunResults], Mapping[str, str]], _Written]
-"""Writes what is told of all runs: results by name, and a sentence for each run whose methods all failed."""
+"""Writes the comparison of all runs: results by name, and a sentence for each run whose methods all failed."""
 
 
 def run_study(study: Study, write: Write[_Written], quiet: bool = False) -> _Written:
-    """Run what is not finished yet, and write what is told of all runs; a second call keeps finished runs.
+    """Run what is not finished yet, and write their comparison; a second call keeps finished runs.
 
     Raises:
         InputError: a run cannot start, its folder holds another run, or the folder is in use; the others are finished.

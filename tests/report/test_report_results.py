@@ -204,6 +204,7 @@ def test_the_schema_refuses_what_the_contract_forbids(results: RunResults) -> No
     assert validator.is_valid(good)
     for spoil in ("before", "pose", "floor", "rows"):
         assert not validator.is_valid({k: v for k, v in good.items() if k != spoil})
+    assert not validator.is_valid(good | {"methods": {"ccnn": {"test": None}}})
     assert validator.is_valid(good | {"methods": {"ccnn": {"test": None, "failed": "Too few rows."}}})
     assert not validator.is_valid(
         good | {"pose": good["pose"] | {"position": good["pose"]["position"] | {"unit": "mm"}}}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from ccnn_torch.report.results.base import Axis, Length, Number, Result, Spread
 
@@ -51,6 +51,11 @@ class RowCounts(Result):
 
 
 class Method(Result):
+    # null without a reason would be a silent failure.
+    model_config = ConfigDict(
+        json_schema_extra={"if": {"properties": {"test": {"type": "null"}}}, "then": {"required": ["failed"]}}
+    )
+
     test: dict[str, Errors] | None
     """null where it could not be trained"""
     ratio_to_floor: Spread | None = None
