@@ -116,6 +116,9 @@ def plan(
     out: Annotated[Path, typer.Option(help="CSV to write; a page .md and a picture .png, .svg are written beside it.")],
     overrides: Words = None,
     mechanism: Mechanism = None,
+    records: Annotated[
+        str | None, typer.Option(help="Taken as other commands take it; a plan needs the machine alone.")
+    ] = None,
     config: ConfigOption = None,
     seed: Seed = None,
     quiet: Quiet = False,
@@ -124,7 +127,7 @@ def plan(
 
     OUT.csv has a row for each pose: the joints to command, q1[unit]…, and the pose at which they bring the nominal
     machine, the most informative ones first. The page beside it gives the gain of each further pose. Keys: mechanism,
-    mechanism_keys, columns, joint_map, parameters.free, .fixed, .tied, .prior, residual, noise, joint_noise, index,
+    mechanism_keys, columns, joint_map, parameters.free, .fixed, .tied, .prior, residual, noise, joint_noise,
     candidates, limits, max_condition, rotation_weight, per_leg, repeat, least_gain, margin, seed. Sizes are in SI, or
     texts with a unit.
 
@@ -148,6 +151,8 @@ def plan(
     wanted = PlanConfig.from_file(file, changes, noted(quiet))
     if wanted.mechanism is None:
         raise InputError("mechanism: is missing; give --mechanism, or the key in a config")
+    if records is not None:
+        noted(quiet)(f"--records {records}: a plan needs the machine alone; the records are not read.")
     check_plan_file(out)
     with progress_bar(quiet, transient=True) as bar:
         task = bar.add_task("poses", total=1.0)
