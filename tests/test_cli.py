@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from ccnn_torch.learners import LEARNERS
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
 
@@ -235,20 +234,6 @@ def test_a_users_own_learner_takes_part(cli: Cli, tmp_path: Path) -> None:
     assert code == 0, err
     assert set(json.loads((out / "results.json").read_text())["methods"]) == {"constant", "Descent"}
     refused(cli("run", EXPERIMENTS / "tripod.yaml", f"methods=[{learner}:linear_data]"), "toy.py", "learner")
-
-
-def test_all_methods_name_those_that_failed(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "run"
-    for name in ("bp_lm", "grnn", "enn", "gp"):
-        monkeypatch.delitem(LEARNERS, name, raising=False)
-    refused(cli("run", EXPERIMENTS / "tripod.yaml", f"out={out}", "methods=[gp]"), "gp", "ccnn")
-    words = [f"out={out}", "methods=all", "save_models=false", NO_REPORT, "enn.generations=3", *FAST]
-    code, _, err = cli("run", EXPERIMENTS / "tripod.yaml", *words)
-    assert code == 0, err
-    methods = json.loads((out / "results.json").read_text())["methods"]
-    assert set(methods) == {"ccnn", "bp_lm", "grnn", "enn", "constant", "gp"}
-    assert methods["gp"] == {"test": None, "failed": "this version has no learner 'gp'"}
-    assert methods["ccnn"]["test"] is not None
 
 
 @pytest.mark.parametrize(

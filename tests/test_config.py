@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, example, given, settings, strategies as st
 
-from ccnn_torch.calibration.config import METHODS, RunConfig, method_names
+from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.config.keys import list_keys
 from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.errors import InputError
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
+from ccnn_torch.learners import LEARNERS
 
 TRIPOD = """
 case: tripod
@@ -42,8 +43,7 @@ def test_file_defaults_and_overrides(tmp_path: Path) -> None:
     assert (plain.name, plain.case, plain.order, plain.variant) == ("trial", "tripod", "raster", None)
     assert (plain.split.kind, plain.split.test, plain.split.validation) == ("random", 0.2, 0.2)
     assert plain.ccnn == CCNNSettings(hidden=(4, 5), weight_mutation=1e-4)
-    assert plain.settings("ccnn")["hidden"] == (4, 5) and plain.settings("constant") == {}
-    assert CCNNSettings(**plain.settings("ccnn")) == plain.ccnn
+    assert plain.settings("ccnn") == plain.ccnn and plain.settings("constant") is None
     changed = config(
         tmp_path,
         TRIPOD,
@@ -78,7 +78,7 @@ def test_variant(tmp_path: Path, text: str, variant: str) -> None:
         ("[ccnn, constant]", ["ccnn", "constant"]),
         ("ccnn", ["ccnn"]),
         ("ccnn,constant", ["ccnn", "constant"]),
-        ("all", list(METHODS)),
+        ("all", list(LEARNERS)),
         ("auto", ["constant", "grnn", "gp", "bp_lm", "enn", "ccnn"]),
     ],
 )

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.config import METHODS, RunConfig, method_names
+from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
 from ccnn_torch.calibration.learning.fitting import Fitted, fit_method, on_other_rows, refit
 from ccnn_torch.calibration.learning.method_choice import Comparison, compare
@@ -19,7 +19,7 @@ from ccnn_torch.calibration.result import best_method, chosen_by, plan_of, run_r
 from ccnn_torch.calibration.rows.prepare import Prepared, damping_of, over_all_rows, prepare
 from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
-from ccnn_torch.learners import LEARNERS, Learner, make_learner
+from ccnn_torch.learners import Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
 from ccnn_torch.numerics.blocks import memory_budget
 from ccnn_torch.report.json_files import plain
@@ -101,7 +101,6 @@ class Calibration:
             return None
         whole = over_all_rows(prepared)
         make = makers(self.config, prepared.default_method)[self.method]
-        assert make is not None
         try:
             fitted = on_other_rows(outcome.fitted, make, whole.dataset, plan_of(self.config))
             found = compensator_of(self.config, whole, fitted, 0)
@@ -199,9 +198,6 @@ def _calibrate(config: RunConfig, folder: RunFolder | None, watch: Watch, prepar
         )
         found = {name: found[name] for name in comparison.order}
     for name, make in found.items():
-        if make is None:
-            failed[name] = f"this version has no learner {name!r}"
-            continue
         watched = partial(watch, prepared, name)
         try:
             if comparison is None:
@@ -264,17 +260,13 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
     )
 
 
-def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], Learner] | None]:
+def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], Learner]]:
     """What makes the learner of each method, by the name that results and files have for it.
 
-    A user's `path/to/file.py:Name` is called `Name` there. None marks a learner that `methods=all` or `auto`
-    asks for and this version does not have.
+    A user's `path/to/file.py:Name` is called `Name` there.
     """
-    found: dict[str, Callable[[], Learner] | None] = {}
+    found: dict[str, Callable[[], Learner]] = {}
     for method in method_names(config, default):
-        if config.methods in (["all"], ["auto"]) and method in METHODS and method not in LEARNERS:
-            found[method] = None
-            continue
         settings = config.settings(method)
         make_learner(method, settings)
         found[method.rpartition(":")[2]] = partial(make_learner, method, settings)

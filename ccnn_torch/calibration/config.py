@@ -5,7 +5,6 @@ Relative paths in a config file start from the file's folder, those on the comma
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
@@ -25,10 +24,8 @@ from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
+from ccnn_torch.learners.registry import LEARNERS
 from ccnn_torch.spelling import nearest
-
-METHODS = ("ccnn", "bp_lm", "grnn", "enn", "constant", "gp")
-"""The learner names of the framework; `ccnn_torch.learners.LEARNERS` has those that this version can make."""
 
 
 def _one(value: Any) -> Any:
@@ -116,7 +113,7 @@ class AutoConfig(_Part):
     @field_validator("methods")
     @classmethod
     def _known(cls, methods: list[str]) -> list[str]:
-        return _checked(methods, METHODS)
+        return _checked(methods, tuple(LEARNERS))
 
 
 def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
@@ -144,7 +141,7 @@ class RunConfig(JobConfig):
     methods: Names | None = Field(
         default=None,
         min_length=1,
-        description=f"learners: a list of {', '.join(METHODS)}; all = these; auto = the best of auto.methods "
+        description=f"learners: a list of {', '.join(LEARNERS)}; all = these; auto = the best of auto.methods "
         "by cross-validation; null = ccnn, and where geometry=auto compared a learner, what that comparison prefers",
     )
     engine: Engine = Field(
@@ -260,7 +257,7 @@ class RunConfig(JobConfig):
     @field_validator("methods")
     @classmethod
     def _known(cls, methods: list[str] | None) -> list[str] | None:
-        for method in _checked(methods or [], (*METHODS, "all", "auto")):
+        for method in _checked(methods or [], (*LEARNERS, "all", "auto")):
             if method in ("all", "auto") and len(methods or []) > 1:
                 raise ValueError(f"'{method}' cannot be combined with other names; remove them or '{method}'")
         return methods
@@ -319,10 +316,9 @@ class RunConfig(JobConfig):
             )
         return self
 
-    def settings(self, method: str) -> dict[str, Any]:
-        """The settings of one method, from the section of its name; {} where it has none."""
-        section = getattr(self, method, None) if method in METHODS else None
-        return dataclasses.asdict(section) if section is not None else {}
+    def settings(self, method: str) -> object:
+        """The section of a method's name; None where it has none."""
+        return getattr(self, method, None) if method in LEARNERS else None
 
 
 def method_names(config: RunConfig, default: str = "ccnn") -> list[str]:
@@ -330,7 +326,7 @@ def method_names(config: RunConfig, default: str = "ccnn") -> list[str]:
     if config.methods is None:
         return [default if config.ccnn == CCNNSettings() else "ccnn"]
     if config.methods == ["all"]:
-        return list(METHODS)
+        return list(LEARNERS)
     if config.methods == ["auto"]:
         return list(config.auto.methods)
     return list(config.methods)

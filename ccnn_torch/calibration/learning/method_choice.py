@@ -103,7 +103,7 @@ class Comparison:
 
 
 def compare(
-    makers: Mapping[str, Callable[[], Learner] | None],
+    makers: Mapping[str, Callable[[], Learner]],
     dataset: Dataset,
     plan: Plan,
     budget: float,
@@ -116,7 +116,7 @@ def compare(
     resumed: how far a budget reaches differs from run to run, and a resumed run must end as it would have.
 
     Args:
-        makers: what makes the learner of each method, in the order to try them; None = this version has none.
+        makers: what makes the learner of each method, in the order to try them.
         budget: seconds inside the learners, for all methods together.
         folder: where checkpoints and decisions go; None = nowhere.
 
@@ -145,7 +145,7 @@ def compare(
 
 def _judge(
     name: str,
-    make: Callable[[], Learner] | None,
+    make: Callable[[], Learner],
     dataset: Dataset,
     plan: Plan,
     comparison: Comparison,
@@ -155,8 +155,6 @@ def _judge(
     """Cross-validate one method; returns a sentence where that is not to be had."""
     budget = comparison.budget
     left = budget - comparison.spent
-    if make is None:
-        return f"this version has no learner {name!r}"
     if left <= 0:
         return f"the budget of {budget:g} s was spent before it began"
     began = time.perf_counter()
