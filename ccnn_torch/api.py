@@ -16,8 +16,7 @@ from ccnn_torch.identification.identify import Identification, identify as _iden
 from ccnn_torch.motion import MotionDiagnosis
 from ccnn_torch.motion.job import diagnosed
 from ccnn_torch.report.results.verify import VerifyResults
-from ccnn_torch.study.sweep import Row, run_sweep
-from ccnn_torch.study.sweep_config import load_sweep
+from ccnn_torch.study.sweep import Row, load_sweep, run_sweep
 from ccnn_torch.verification.job import verify_model
 
 

@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_run import short
 
 from ccnn_torch.calibration.job import RUN
-from ccnn_torch.calibration.page.figure_progress import progress_plot
+from ccnn_torch.calibration.page.figures import progress_plot
 from ccnn_torch.calibration.page.long_table import long_table
 from ccnn_torch.calibration.page.reach import reach_block
 from ccnn_torch.calibration.page.tables import result_tables, run_page

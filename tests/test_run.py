@@ -29,7 +29,7 @@ from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.run_folder.folder import RunFolder
-from ccnn_torch.study.suite_config import load_suite
+from ccnn_torch.study.suite import load_suite
 
 Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent

@@ -11,7 +11,7 @@ from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.records import read_table
-from ccnn_torch.verification.config import VerifyConfig
+from ccnn_torch.verification.job import VerifyConfig
 
 Cli = Callable[..., tuple[int, str, str]]
 PLANNED = ("candidates=300", "--quiet", "--poses", 8, "--out")

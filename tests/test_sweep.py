@@ -16,10 +16,10 @@ from frozen import frozen
 from ccnn_torch import api
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import RUN
-from ccnn_torch.calibration.rows import memory
+from ccnn_torch.calibration.rows import prepare
 from ccnn_torch.compensation import load_model
 from ccnn_torch.errors import InputError
-from ccnn_torch.study.sweep_config import load_sweep
+from ccnn_torch.study.sweep import load_sweep
 
 Cli = Callable[..., tuple[int, str, str]]
 QUICK = {"hidden": [3], "restarts": 1, "iterations": 4}
@@ -163,7 +163,7 @@ def test_repeats_that_memory_does_not_hold_run_in_blocks_or_not_at_all(
 ) -> None:
     keys: dict[str, Any] = {"case": "tripod", "methods": ["constant", "bp_lm"], "bp_lm": QUICK}
     keys |= {"save_models": False, "save_report": False}
-    each = memory.memory_of_run(RunConfig.from_keys(**keys), 125, 3)
+    each = prepare.memory_of_run(RunConfig.from_keys(**keys), 125, 3)
     out = RUN.start(
         RunConfig.from_keys(**keys, repeats=5, max_bytes=2 * each, out=str(tmp_path / "run")), quiet=True
     ).path
@@ -174,16 +174,16 @@ def test_repeats_that_memory_does_not_hold_run_in_blocks_or_not_at_all(
     assert best["score"]["median"] == min(block["score"]["median"] for block in results["methods"].values())
     assert results["pose"]["position"]["after"]["rms"] == best["pose"]["position"]["rms"]
     # What is free is a quarter's limit: three repeats at once of ten.
-    monkeypatch.setattr(memory, "free_memory", lambda: 12 * each)
-    with pytest.raises(memory.TooManyRepeatsError) as told:
-        memory.check_memory(RunConfig.from_keys(**keys, repeats=10), 125, 3)
+    monkeypatch.setattr(prepare, "free_memory", lambda: 12 * each)
+    with pytest.raises(prepare.TooManyRepeatsError) as told:
+        prepare.check_memory(RunConfig.from_keys(**keys, repeats=10), 125, 3)
     assert told.value.block == 3
-    assert memory.check_memory(RunConfig.from_keys(**keys, repeats=3), 125, 3) == []
+    assert prepare.check_memory(RunConfig.from_keys(**keys, repeats=3), 125, 3) == []
     # One repeat may take what is free, and is told when it is near.
-    monkeypatch.setattr(memory, "free_memory", lambda: each + 1)
-    assert "stopped by the system" in memory.check_memory(RunConfig.from_keys(**keys), 125, 3)[0]
+    monkeypatch.setattr(prepare, "free_memory", lambda: each + 1)
+    assert "stopped by the system" in prepare.check_memory(RunConfig.from_keys(**keys), 125, 3)[0]
     for given in ({"max_bytes": each - 1}, {"repeats": 1000, "max_bytes": each}):
         needed = f"{each * given.get('repeats', 1):,} bytes"
         with pytest.raises(InputError, match=needed) as refused:
             RUN.start(RunConfig.from_keys(**keys, **given, out=str(tmp_path / "no")), quiet=True)
-        assert not isinstance(refused.value, memory.TooManyRepeatsError) and not (tmp_path / "no").exists()
+        assert not isinstance(refused.value, prepare.TooManyRepeatsError) and not (tmp_path / "no").exists()

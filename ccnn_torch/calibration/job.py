@@ -17,8 +17,7 @@ from ccnn_torch.calibration.outputs import write_outputs
 from ccnn_torch.calibration.page.tables import errors_line, run_page
 from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback
 from ccnn_torch.calibration.result import plan_of
-from ccnn_torch.calibration.rows.memory import TooManyRepeatsError
-from ccnn_torch.calibration.rows.prepare import Prepared, prepare
+from ccnn_torch.calibration.rows.prepare import Prepared, TooManyRepeatsError, prepare
 from ccnn_torch.calibration.statistics import share_unit
 from ccnn_torch.engine import Failure, Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError, WriteError

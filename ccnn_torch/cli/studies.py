@@ -47,8 +47,7 @@ def suite(
 
     ccnn suite experiments/realistic.yaml realistic.noise=1e-6 --out runs/quiet_tracker --seed 100
     """
-    from ccnn_torch.study.suite import run_suite
-    from ccnn_torch.study.suite_config import load_suite
+    from ccnn_torch.study.suite import load_suite, run_suite
 
     _, changes = config_and_changes([], None, out=out, seed=seed)
     run_suite(load_suite(config, [*(overrides or []), *changes]), quiet=quiet)
@@ -78,8 +77,7 @@ def sweep(
 
     ccnn sweep experiments/tripod.yaml seed=0,10,20 repeats=10 --out runs/seeds --engine tcp://10.0.0.5:8786
     """
-    from ccnn_torch.study.sweep import run_sweep
-    from ccnn_torch.study.sweep_config import load_sweep
+    from ccnn_torch.study.sweep import load_sweep, run_sweep
 
     words = [*(changes or []), *([] if engine is None else [f"engine={engine}"])]
     run_sweep(load_sweep(config, words, out), quiet=quiet)

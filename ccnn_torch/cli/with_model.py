@@ -229,8 +229,7 @@ def verify(
     """
     with if_stopped(NOTHING_WRITTEN):
         from ccnn_torch.compensation import load_compensation
-        from ccnn_torch.verification.config import VerifyConfig
-        from ccnn_torch.verification.job import verify_model
+        from ccnn_torch.verification.job import VerifyConfig, verify_model
         from ccnn_torch.verification.page import write_verify_report
 
         file, changes = config_and_changes([], config, records=records or records_option, mechanism=mechanism)

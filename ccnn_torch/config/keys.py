@@ -23,7 +23,7 @@ _FEW = 8
 _COMMANDS = {
     "run": "ccnn_torch.calibration.config:RunConfig",
     "identify": "ccnn_torch.identification.config:IdentifyConfig",
-    "suite": "ccnn_torch.study.suite_config:SuiteFile",
+    "suite": "ccnn_torch.study.suite:SuiteFile",
     "plan": "ccnn_torch.planning.config:PlanConfig",
     "diagnose": "ccnn_torch.diagnosis.config:DiagnoseConfig",
 }

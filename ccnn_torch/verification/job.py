@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from pydantic import Field
 from torch import Tensor
 
 from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
+from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap
 from ccnn_torch.display import count_text
-from ccnn_torch.mechanisms import SerialArm
+from ccnn_torch.mechanisms import PoseError, SerialArm
 from ccnn_torch.records import check_rows, load_records
+from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.results.base import Length
-from ccnn_torch.report.results.verify import Error, JointError, VerifyResults
-from ccnn_torch.verification.moved_frame import Motion, fit_motion
+from ccnn_torch.report.results.verify import Error, JointError, Promised, Size, VerifyResults
+from ccnn_torch.verification.page import verify_text
 from ccnn_torch.verification.prediction import (
+    Motion,
     Rows,
+    fit_motion,
     judge,
     mapped_columns,
     nominal_mechanism,
@@ -24,8 +31,6 @@ from ccnn_torch.verification.prediction import (
     pseudoerror_settings,
 )
 from ccnn_torch.verification.promise import configurations, paired_gain, promise_of, promised
-from ccnn_torch.verification.result import Verified, error_of, figure_arrays, rms_of
-from ccnn_torch.verification.tables import verify_text
 
 # A moved measuring frame is suspected if correcting it halves the remaining RMS error at least.
 _SUSPECT = 0.5
@@ -136,3 +141,53 @@ def _moved(rows: Rows, results: VerifyResults) -> list[str]:
         f"The measuring device seems to have moved since the model was made: a rigid motion of its frame by "
         f"{motion.words} would leave {1e3 * left:.3g} mm RMS; if it was moved, judge with --refit-frames."
     ]
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What was found, and the arrays that its pictures need, all rows held out."""
+
+    results: VerifyResults
+    arrays: RunArrays
+
+
+def error_of(unit: Length, before: Tensor | None, after: Tensor | None, promise: Promised | None) -> Error | None:
+    """The errors of all rows before and after, `s` [unit]; None where there are none."""
+    if before is None or after is None:
+        return None
+    first, last = (Size(rms=float(e.square().mean().sqrt()), max=float(e.max())) for e in (before, after))
+    return Error(unit=unit, before=first, after=last, promised=promise)
+
+
+def rms_of(values: Tensor) -> float | None:
+    return float(values.square().mean().sqrt()) if values.numel() else None
+
+
+def figure_arrays(rows: Rows, measured: Tensor, left: Tensor, before: PoseError, after: PoseError) -> RunArrays:
+    return RunArrays(
+        joints=rows.mechanism.joints,
+        commanded=rows.joints.numpy(),
+        measured=measured.detach().numpy(),
+        predicted=(measured - left).detach().numpy(),
+        test=np.ones(len(rows.joints), dtype=np.bool_),
+        place=rows.mechanism.frame(rows.pose)[0].numpy(),
+        position_before=before.position.detach().numpy(),
+        position_after=after.position.detach().numpy(),
+        rotation_before=None if before.rotation is None else before.rotation.detach().numpy(),
+        rotation_after=None if after.rotation is None else after.rotation.detach().numpy(),
+        labels={"mechanism": rows.mechanism.name},
+    )
+
+
+class VerifyConfig(JobConfig):
+    """Keys of `ccnn verify`, which mean the same in a config for `ccnn run`."""
+
+    of_a_run = ("records", "columns", "joint_map", "mechanism", "mechanism_keys")
+
+    records: Files | None = Field(default=None, description="new rows; the same as RECORDS.csv and --records")
+    columns: Columns
+    joint_map: JointMap
+    mechanism: str | None = Field(
+        default=None, description="the nominal machine; the same as --mechanism; null = the model's"
+    )
+    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")

@@ -14,8 +14,7 @@ from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.colors import LogNorm
 from report_runs import arm_run
 
-from ccnn_torch.calibration.page.figure_learning import convergence_plot, population_plot
-from ccnn_torch.calibration.page.figure_network import alive_nodes, network_plot
+from ccnn_torch.calibration.page.figures import alive_nodes, convergence_plot, network_plot, population_plot
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays

@@ -13,11 +13,11 @@ from ccnn_torch.calibration.geometry.frames import frames_of_repeats
 from ccnn_torch.calibration.geometry.physics import fit_physics
 from ccnn_torch.calibration.learning.early_stop import Plan
 from ccnn_torch.calibration.learning.fitting import fit_method
-from ccnn_torch.calibration.rows.dataset import dataset_of
-from ccnn_torch.calibration.rows.some_rows import rows_of
+from ccnn_torch.calibration.rows.dataset import dataset_of, rows_of
 from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import make_learner
+from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import joint_deviations
@@ -35,7 +35,7 @@ _MOST_ROWS = 600
 _LEARNER = "gp"
 # What is trained where nothing was compared.
 _ELSE = "ccnn"
-_QUICK = {"steps": 30, "hyperparameter_rows": 200, "variance_rows": 16}
+_QUICK = GPSettings(steps=30, hyperparameter_rows=200, variance_rows=16)
 # Steps to the command of a learned deviation of the joints, which is steep near the singular poses of an arm.
 _COMMANDS = 8
 

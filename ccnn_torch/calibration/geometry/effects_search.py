@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.rows.some_rows import rows_of
+from ccnn_torch.calibration.rows.dataset import rows_of
 from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, usable_verdict
 from ccnn_torch.diagnosis.from_records import situation_of
 from ccnn_torch.diagnosis.joint_fit import effects_that_pay, fit_jointly, loose_parameters, on_fitted_frames

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ccnn_torch.calibration.page.figure_learning import convergence_plot, population_plot
-from ccnn_torch.calibration.page.figure_network import network_plot
-from ccnn_torch.calibration.page.figure_progress import progress_plot
+from ccnn_torch.calibration.page.figures import convergence_plot, network_plot, population_plot, progress_plot
 from ccnn_torch.calibration.page.tables import run_page, write_tables
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history

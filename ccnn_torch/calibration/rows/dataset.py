@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.pseudoerror import Pseudoerror
+from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
 from ccnn_torch.training import Scaling
 
@@ -186,3 +187,10 @@ def dataset_of(
 def by_repeat(rows: Tensor, seeds: list[int]) -> Tensor:
     """Rows of every repeat, `r x s x d`, whether they have repeats or share them."""
     return rows.expand(len(seeds), *rows.shape[-2:])
+
+
+def rows_of(records: Records, rows: Tensor) -> Records:
+    """Rows by their numbers, `t`."""
+    columns = {name: values[rows.numpy()] for name, values in records.columns.items()}
+    parts = {key: getattr(records, key)[rows] for key in ("joints", "pose", "covariates")}
+    return replace(records, **parts, columns=columns, lines=records.lines[rows.numpy()], parts=())

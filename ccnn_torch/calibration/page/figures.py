@@ -1,0 +1,259 @@
+"""Figures of a run: training curves as median and 90 % band over the repeats, error against effort, the network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.colors import TwoSlopeNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ccnn_torch.calibration.page.reach import CURVE
+from ccnn_torch.display import count_text
+from ccnn_torch.evolution.network import alive_nodes as path_nodes
+from ccnn_torch.report.figures.style import FLOOR, GREY, SERIES, Plot, bare, styled
+
+Array = NDArray[np.float64]
+
+
+@styled
+def convergence_plot(
+    history: Mapping[str, Array],
+    method: str,
+    *,
+    floor: float | None = None,
+    constant: float | None = None,
+    unit: str = "1",
+) -> Plot | None:
+    """Fitness and errors against the step of training.
+
+    Args:
+        history: `step`: `t`, metrics `t x r` (`fitness_best`, `fitness_mean`, `error_train`, `error_validation`,
+            `heldout_mse_all` or `heldout_mse_JOINT`); those that are there are drawn.
+        floor, constant: mse of the noise floor and of the constant predictor over all joints [unit²], drawn as lines
+            where `heldout_mse_all` is.
+        unit: the joints' SI unit.
+
+    Returns:
+        None when the history has none of these metrics, or a single step, which converges to nothing.
+    """
+    step = history["step"]
+    if len(step) < 2:
+        return None
+    panels = [
+        ("Fitness", "fitness [1]", [n for n in ("fitness_best", "fitness_mean") if n in history], False),
+        ("Training error", "error, standardised [1]", [n for n in history if n.startswith("error_")], True),
+        ("Held-out error", f"mse [{_square(unit)}]", _held_out(history), True),
+    ]
+    panels = [panel for panel in panels if panel[2]]
+    if not panels:
+        return None
+    figure = Figure(figsize=(4.5 * len(panels) + (1.5 if len(panels) == 1 else 0), 3.5), layout="constrained")
+    for axes, (title, quantity, names, log) in zip(
+        figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True
+    ):
+        for i, name in enumerate(names):
+            label = "all joints" if name == "heldout_mse_all" else name.split("_", 1)[1].replace("_", " ")
+            _draw_band(axes, step, history[name], SERIES[i % len(SERIES)], label)
+        if "heldout_mse_all" in names:
+            for value, style, text in ((constant, ":", "constant"), (floor, "--", "noise floor")):
+                if value is not None:
+                    axes.axhline(value, color=FLOOR, linestyle=style, linewidth=1.6, label=text)
+        if log and all((history[name][np.isfinite(history[name])] > 0).all() for name in names):
+            axes.set_yscale("log")
+        axes.set(title=title, xlabel="step of training", ylabel=quantity)
+        axes.legend(loc="best")
+    repeats = history[panels[0][2][0]].shape[1]
+    band = f"; lines are medians and bands 5 % to 95 % over {repeats} repeats" * (repeats > 1)
+    return Plot(f"convergence_{method}", figure, f"Progress of {method} over {len(step)} recorded steps{band}.")
+
+
+@styled
+def population_plot(history: Mapping[str, Array], method: str) -> Plot | None:
+    """Connection density and diversity of each subpopulation against the generation.
+
+    Args:
+        history: `step`: `t`, `density` and `diversity`: `t x r x k`.
+
+    Returns:
+        None when the history has neither.
+    """
+    names = [name for name in ("density", "diversity") if name in history]
+    if not names:
+        return None
+    texts = {"density": "share of connections [1]", "diversity": "diversity [1]"}
+    figure = Figure(figsize=(4.5 * len(names) + (1.5 if len(names) == 1 else 0), 3.3), layout="constrained")
+    for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        values = history[name]
+        for i in range(values.shape[2]):
+            _draw_band(axes, history["step"], values[..., i], SERIES[i % len(SERIES)], f"subpopulation {i + 1}")
+        axes.set(title=name.capitalize(), xlabel="generation", ylabel=texts[name])
+        axes.set_ylim(bottom=0)
+        axes.legend(loc="best")
+    layers, repeats = history[names[0]].shape[2], history[names[0]].shape[1]
+    return Plot(
+        f"population_{method}",
+        figure,
+        f"{' and '.join(names).capitalize()} of the {layers} subpopulations of {method} (one for each layer of "
+        f"connections, the first next to the inputs), over {count_text(repeats, 'repeat')}.",
+    )
+
+
+def _held_out(history: Mapping[str, Array]) -> list[str]:
+    if "heldout_mse_all" in history:
+        return ["heldout_mse_all"]
+    return sorted(name for name in history if name.startswith("heldout_mse_"))
+
+
+def _draw_band(axes: Axes, step: Array, values: Array, colour: str, label: str) -> None:
+    """Median over the repeats and, when there are several, the 5 % to 95 % band; values: `t x r`."""
+    low, median, high = np.nanquantile(values, [0.05, 0.5, 0.95], axis=1)
+    if values.shape[1] > 1:
+        axes.fill_between(step, low, high, color=colour, alpha=0.18, linewidth=0)
+    axes.plot(step, median, color=colour, label=label)
+
+
+def _square(unit: str) -> str:
+    return "1" if unit == "1" else f"{unit}²"
+
+
+_AXES = (
+    ("seconds", "time inside the learner [s]"),
+    ("evaluations", "evaluations [1]"),
+)
+
+
+@styled
+def progress_plot(
+    histories: Mapping[str, Mapping[str, Array]],
+    *,
+    floor: float | None = None,
+    constant: float | None = None,
+    unit: str = "1",
+) -> Plot | None:
+    """Held-out error of every method against what it cost.
+
+    Args:
+        histories: training curves by method: `heldout_mse_all` [unit²], `seconds` and, where counted, `evaluations`,
+            each `t x r`.
+        floor, constant: mse of the noise floor and of the constant predictor over all joints [unit²].
+        unit: the joints' SI unit.
+
+    Returns:
+        None where fewer than two methods have such curves.
+    """
+    shown = {name: found for name, found in histories.items() if CURVE in found and "seconds" in found}
+    panels = [entry for entry in _AXES if any(entry[0] in found for found in shown.values())]
+    if len(shown) < 2:
+        return None
+    figure = Figure(figsize=(4.8 * len(panels), 3.9), layout="constrained")
+    for axes, (axis, label) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        for i, (name, found) in enumerate(shown.items()):
+            if axis in found:
+                _draw(axes, found[axis], found[CURVE], SERIES[i % len(SERIES)], name)
+        for value, style, text in ((constant, ":", "constant correction"), (floor, "--", "noise floor")):
+            if value is not None and value > 0:
+                axes.axhline(value, color=FLOOR, linestyle=style, linewidth=1.6, label=text)
+        axes.set(xscale="log", yscale="log", xlabel=label)
+    first = figure.axes[0]
+    first.set_ylabel(f"held-out mse [{'1' if unit == '1' else f'{unit}²'}]")
+    handles, labels = first.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 8))
+    repeats = next(iter(shown.values()))[CURVE].shape[1]
+    return Plot(
+        "progress",
+        figure,
+        "Error on held-out rows against what it cost, in the fit on all training rows: time (one repeat's share) and "
+        "passes of the training rows through one model. Dots are the last steps. "
+        f"Medians over {count_text(repeats, 'repeat')}.",
+    )
+
+
+def _draw(axes: Axes, cost: Array, error: Array, colour: str, label: str) -> None:
+    """cost, error: `t x r`."""
+    x, y = np.nanmedian(cost, axis=1), np.nanmedian(error, axis=1)
+    there = (x > 0) & (y > 0)
+    axes.plot(x[there], y[there], color=colour, label=label)
+    axes.plot(x[there][-1:], y[there][-1:], "o", color=colour, markersize=5)
+
+
+Mask = NDArray[np.bool_]
+
+
+def alive_nodes(masks: Sequence[Mask]) -> list[Mask]:
+    """Which nodes carry a signal from an input to an output (paper 000, section III-E).
+
+    A hidden node without a living input or without a living output is dead, and so on through the layers.
+
+    Args:
+        masks: layer by layer, `out x in`.
+
+    Returns:
+        One array a layer of nodes, inputs first; inputs and outputs always count as alive.
+    """
+    hidden = path_nodes([torch.as_tensor(mask) for mask in masks])
+    ends = np.ones(masks[0].shape[1], dtype=bool), np.ones(masks[-1].shape[0], dtype=bool)
+    return [ends[0], *(nodes.numpy() for nodes in hidden), ends[1]]
+
+
+@styled
+def network_plot(masks: Sequence[Mask], weights: Sequence[Array], method: str, joints: Sequence[str] = ()) -> Plot:
+    """Draw the connections of a network.
+
+    Args:
+        masks: layer by layer, `out x in`.
+        weights: layer by layer, `out x (in + 1)`, last column = bias.
+        joints: names of the outputs, `n`.
+    """
+    alive = alive_nodes(masks)
+    shown = [
+        np.where(np.c_[mask, np.ones(len(mask), dtype=bool)], w, np.nan) for mask, w in zip(masks, weights, strict=True)
+    ]
+    for i, values in enumerate(shown):
+        values[~alive[i + 1]] = np.nan
+        values[:, :-1][:, ~alive[i]] = np.nan
+    limit = max(float(np.nanmax(np.abs(values), initial=0.0)) for values in shown) or 1.0
+    norm = TwoSlopeNorm(0.0, -limit, limit)
+    columns = [mask.shape[1] + 1 for mask in masks]
+    figure = Figure(
+        figsize=(max(7.0, 0.36 * sum(columns) + 2.6), 0.32 * max(len(m) for m in masks) + 1.9), layout="constrained"
+    )
+    drawn: Any = None
+    for i, axes in enumerate(figure.subplots(1, len(masks), squeeze=False, width_ratios=columns)[0]):
+        _grey_dead(axes, alive[i], alive[i + 1])
+        drawn = axes.pcolormesh(shown[i], cmap="RdBu_r", norm=norm, edgecolors="#DDDDDD", linewidth=0.6)
+        bare(axes)
+        axes.invert_yaxis()
+        axes.set_aspect("equal")
+        axes.set_anchor("N")
+        last = i == len(masks) - 1
+        axes.set_title("to the outputs" if last else f"to hidden layer {i + 1}")
+        axes.set_xlabel("input" if i == 0 else f"node of hidden layer {i}")
+        axes.set_ylabel("output" if last else f"node of hidden layer {i + 1}")
+        axes.set_xticks(np.arange(columns[i]) + 0.5, [*(str(k + 1) for k in range(columns[i] - 1)), "bias"])
+        names = list(joints) if last and joints else [str(k + 1) for k in range(len(masks[i]))]
+        axes.set_yticks(np.arange(len(masks[i])) + 0.5, names)
+        axes.tick_params(length=0, labelsize=7.5)
+        axes.get_xticklabels()[-1].set_rotation(90)
+    bar = figure.colorbar(drawn, ax=figure.axes, shrink=0.8, pad=0.02)
+    bar.set_label("weight [1]")
+    bar.outline.set_visible(False)
+    there = sum(int(mask.sum()) for mask in masks)
+    dead = sum(int((~nodes).sum()) for nodes in alive[1:-1])
+    return Plot(
+        f"network_{method}",
+        figure,
+        f"The network of {method}: {there} of {sum(m.size for m in masks)} possible connections (white = none), "
+        f"{count_text(dead, 'dead node')} (grey), which the exported model leaves out.",
+    )
+
+
+def _grey_dead(axes: Axes, before: Mask, after: Mask) -> None:
+    for row in np.flatnonzero(~after):
+        axes.axhspan(float(row), float(row) + 1, color=GREY, linewidth=0)
+    for column in np.flatnonzero(~before):
+        axes.axvspan(float(column), float(column) + 1, color=GREY, linewidth=0)
