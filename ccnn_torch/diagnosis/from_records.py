@@ -21,7 +21,7 @@ from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, sim
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
 from ccnn_torch.errors import InputError, RowsError
-from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, fit_frames, judge_frames
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, as_measured, fit_frames, judge_frames
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES
@@ -119,8 +119,7 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
             f"records: they have {records.joints.shape[-1]} joints and {mechanism.name} has {len(mechanism.joints)}; "
             "load them with the mechanism that was measured"
         )
-    if isinstance(mechanism, SerialArm) and records.orientation == "none":
-        mechanism = mechanism.with_orientation("none")
+    mechanism = as_measured(mechanism, records.pose_coordinates)
     parameters = None
     if isinstance(mechanism, SerialArm) and mechanism.unknown_frames:
         parameters = fit_frames(mechanism, records.joints, records.pose, columns=records.columns)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects.situation import Situation
-from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
+from ccnn_torch.mechanisms import Framed, Mechanism, Partial, SerialArm
 from ccnn_torch.numerics.rotations import skew
 
 _SHOWN = 1e-9
@@ -53,6 +53,7 @@ def per_force(unit: str) -> str:
 
 def own_parameters(mechanism: Mechanism) -> list[int]:
     """Numbers of the parameters that are the mechanism's own: not those of its base frame and tool frame."""
+    mechanism = mechanism.mechanism if isinstance(mechanism, Partial) else mechanism
     first, last = 0, len(mechanism.geometry)
     if isinstance(mechanism, SerialArm):
         return list(range(6, last - 6))

@@ -121,8 +121,8 @@ class Compliance(Effect):
 
 def _stretching(situation: Situation) -> Tensor:
     """Change of the pose by the members of a machine with legs, `... x s x c x (members)`."""
-    slope = torch.nan_to_num(situation.parameter_jacobian)
-    torques = slope.mT @ situation.wrench.unsqueeze(-1)
+    slope, whole = torch.nan_to_num(situation.parameter_jacobian), situation.whole
+    torques = torch.nan_to_num(whole.parameter_jacobian).mT @ whole.wrench.unsqueeze(-1)
     found = members(situation.mechanism)
     moved = [slope[..., m.lengths] @ torques[..., m.lengths, :] for m in found]
     return torch.cat(moved, -1) if found else slope[..., :0]
@@ -237,6 +237,6 @@ def _off_centre(situation: Situation) -> Tensor:
     assert rotation is not None
     moment = torch.linalg.cross(rotation.mT, situation.down.expand_as(rotation), dim=-1)
     scale = torch.tensor([SCALE[j.unit] for j in situation.mechanism.joints], dtype=rotation.dtype)
-    jacobian = torch.nan_to_num(situation.jacobian)
+    jacobian = torch.nan_to_num(situation.whole.jacobian)
     torques: Tensor = jacobian[..., 3:, :].mT @ moment.mT
     return scale[:, None] * torques

@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms import Mechanism, Partial, SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
@@ -58,6 +58,14 @@ class Situation:
         return self.mechanism.under(self.covariates)
 
     @cached_property
+    def whole(self) -> Situation:
+        """The same rows of the mechanism with its whole pose, whatever of it is measured: loads act on all of it."""
+        if not isinstance(self.mechanism, Partial):
+            return self
+        guess = None if self.guess is None else self.mechanism.filled(self.guess)
+        return replace(self, mechanism=self.mechanism.mechanism, guess=guess)
+
+    @cached_property
     def pose(self) -> Tensor:
         """Nominal pose at the commanded joints, `... x s x p` [SI]."""
         return self.machine.forward_kinematics(self.joints, self.parameters, self.guess).detach()
@@ -93,8 +101,10 @@ class Situation:
     def platform(self) -> tuple[Tensor, Tensor | None]:
         """Nominal position `... x s x 3` [m] and rotation matrix of the measured frame; 0 where there is no pose.
 
-        An arm has a rotation also where only its position is measured.
+        A machine has a rotation also where only its position is measured.
         """
+        if self.whole is not self:
+            return self.whole.platform
         if isinstance(self.mechanism, SerialArm):
             return self.mechanism.forward_frame(self.joints, self.parameters)
         return self.mechanism.frame(_known(self.pose))
@@ -140,7 +150,7 @@ class Situation:
     @property
     def loaded(self) -> bool:
         """Whether a load on the platform was recorded."""
-        return any(f"load_{c.name}" in self.covariates for c in self.mechanism.pose)
+        return any(f"load_{c.name}" in self.covariates for c in self.whole.mechanism.pose)
 
     @cached_property
     def wrench(self) -> Tensor:
@@ -173,12 +183,16 @@ class Situation:
         """
         if not self.loaded:
             return torch.zeros_like(self.joints)
+        if self.whole is not self:
+            return self.whole.load_torque
         torque: Tensor = _known(self.jacobian).mT @ self.wrench.unsqueeze(-1)
         return torque.squeeze(-1)
 
     @cached_property
     def weight_torque(self) -> Tensor:
         """Force or torque on each joint of 1 N of weight on the platform, `... x s x n` [N or N·m per N]."""
+        if self.whole is not self:
+            return self.whole.weight_torque
         # As a matrix product: the ONNX exporter gets that of a stack of matrices with one vector wrong.
         torque: Tensor = _known(self.jacobian)[..., :3, :].mT @ self.down.unsqueeze(-1)
         return torque.squeeze(-1)
@@ -189,13 +203,15 @@ class Situation:
 
         Of an arm it is spread evenly over the origins of its links and the tool; of others it is the platform's.
         """
-        return self._links_torque(torch.ones_like) if isinstance(self.mechanism, SerialArm) else self.weight_torque
+        if isinstance(self.whole.mechanism, SerialArm):
+            return self.whole._links_torque(torch.ones_like)
+        return self.weight_torque
 
     @cached_property
     def inner_weight_torque(self) -> Tensor:
         """As `own_weight_torque` of an arm whose links are the heavier the nearer they are to its base: the weight at
         an origin falls linearly to 0 at the tool."""
-        return self._links_torque(lambda far: 1 - far)
+        return self.whole._links_torque(lambda far: 1 - far)
 
     def _links_torque(self, heavy: Callable[[Tensor], Tensor]) -> Tensor:
         """Torques of 1 N over the origins of an arm's links and the tool, `... x s x n`; heavy: the share of each by

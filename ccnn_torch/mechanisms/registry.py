@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.files.dh_file import read_dh_file, read_urdf
 from ccnn_torch.mechanisms.files.mechanism_file import MechanismFile, read_mechanism_file
 from ccnn_torch.mechanisms.frames.framed import Framed
+from ccnn_torch.mechanisms.frames.partial import Partial
 from ccnn_torch.mechanisms.machines.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.machines.five_bar import FiveBar
 from ccnn_torch.mechanisms.machines.overconstrained import Overconstrained2Dof
@@ -193,12 +194,19 @@ def _framed(
                 f"mechanism 'framed': {name} is true or false, whether that frame is fitted, not {value!r}; keys of "
                 "the mechanism inside go under keys: {mechanism: delta, keys: {base: 0.2}}"
             )
+    return Framed(_inside(mechanism, keys), base, tool, rotation_weight)
+
+
+def _inside(mechanism: str | Mapping[str, Any], keys: Mapping[str, Any] | None) -> Mechanism:
     # The reader of the file that contains this decides whether code may run.
     if isinstance(mechanism, str):
-        inner = load_mechanism(mechanism, **(keys or {}))
-    else:
-        inner = mechanism_from_description(mechanism, allow_code=True)
-    return Framed(inner, base, tool, rotation_weight)
+        return load_mechanism(mechanism, **(keys or {}))
+    return mechanism_from_description(mechanism, allow_code=True)
+
+
+def _partial(mechanism: str | Mapping[str, Any], pose: Sequence[str], keys: Mapping[str, Any] | None = None) -> Partial:
+    """A mechanism by name or file with its keys, or by description, of which some pose coordinates are measured."""
+    return Partial(_inside(mechanism, keys), pose)
 
 
 REGISTRY: dict[str, Callable[..., Mechanism]] = {
@@ -211,6 +219,7 @@ REGISTRY: dict[str, Callable[..., Mechanism]] = {
     "delta_linear": DeltaLinear,
     "serial": SerialArm,
     "framed": _framed,
+    "partial": _partial,
 }
 
 _READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
@@ -232,7 +241,7 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
             function that makes one.
         allow_code: run the Python file that an identified machine's mechanism file names.
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
-            framed: mechanism, its keys, base, tool; …).
+            framed: mechanism, its keys, base, tool; partial: mechanism, its keys, pose; …).
 
     Raises:
         InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, a
@@ -256,7 +265,7 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
     else:
         mechanism = _call(spec, maker, keys)
-    if (spec in REGISTRY or is_plugin(spec)) and not isinstance(mechanism, Framed):
+    if (spec in REGISTRY or is_plugin(spec)) and not isinstance(mechanism, Framed | Partial):
         mechanism.recipe = {"spec": spec, "keys": keys}
     return mechanism
 

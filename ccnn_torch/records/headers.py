@@ -218,26 +218,36 @@ def stack_columns(table: Table, coordinates: Sequence[Coordinate], angle_limit: 
 
 
 def read_pose(
-    table: Table, mechanism: HasCoordinates
+    table: Table, mechanism: HasCoordinates, partial: bool = False
 ) -> tuple[NDArray[np.float64], tuple[Coordinate, ...], str | None, tuple[str, ...]]:
     """Pose `rows x p` [SI], its coordinates, how the orientation was measured, and the columns that were read.
 
     A rotation vector counts before a quaternion, and that before Euler angles, where a file has several.
 
+    Args:
+        partial: whether some of the pose coordinates are enough.
+
     Raises:
         InputError: a column is missing or cannot be used, or a quaternion has not the norm 1.
     """
     if not mechanism.orientations:
-        pose = tuple(mechanism.pose)
+        pose = _measured(table, mechanism.pose, mechanism) if partial else mechanism.pose
+        pose = tuple(pose or mechanism.pose)
         return stack_columns(table, pose, _POSE_LIMIT), pose, None, tuple(c.name for c in pose)
     position = tuple(c for c in mechanism.pose if c.name not in _ROTATION_VECTOR)
-    full = (*position, *(Coordinate(name, "rad") for name in _ROTATION_VECTOR))
+    turns = tuple(Coordinate(name, "rad") for name in _ROTATION_VECTOR)
     forms = {"rotation_vector": _ROTATION_VECTOR, "quaternion": _QUATERNION}
     forms |= {name: columns for name, (columns, _) in EULER_ANGLES.items()}
     form = next((name for name, columns in forms.items() if any(column in table for column in columns)), "none")
     read = (*(c.name for c in position), *forms.get(form, ()))
+    if partial:
+        turns = _measured(table, turns, mechanism) if form == "rotation_vector" else turns
+        there = _measured(table, position, mechanism)
+        position = position if form == "none" and not there else there
+        read = (*(c.name for c in position), *(forms[form] if form not in ("none", "rotation_vector") else ()))
+    full = (*position, *turns)
     if form == "rotation_vector":
-        return stack_columns(table, full, _POSE_LIMIT), full, form, read
+        return stack_columns(table, full, _POSE_LIMIT), full, form, tuple(c.name for c in full)
     where = stack_columns(table, position)
     if form == "none":
         return where, position, form, read
@@ -251,6 +261,14 @@ def read_pose(
         angles = stack_columns(table, [Coordinate(name, "rad") for name in columns], _POSE_LIMIT)
         turn = Rotation.from_euler(axes, angles)
     return np.concatenate([where, turn.as_rotvec()], axis=1), full, form, read
+
+
+def _measured(table: Table, pose: Sequence[Coordinate], mechanism: HasCoordinates) -> tuple[Coordinate, ...]:
+    """The coordinates that the table has; all of them where a column without another use may be one that it lacks."""
+    known = {c.name for c in (*mechanism.joints, *mechanism.pose)}
+    free = [name for name in table.names if name not in known]
+    meant = any(c.name not in table and nearest(c.name, free) for c in pose)
+    return tuple(c for c in pose if meant or c.name in table)
 
 
 def check_joints(table: Table, joints: Sequence[Coordinate]) -> None:

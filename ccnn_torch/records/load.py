@@ -198,12 +198,13 @@ def load_records(
     table = with_joints(read_source(source, columns), read_joint_map(joint_map or {}, mechanism.joints, columns))
     check_joints(table, mechanism.joints)
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
-    pose, coordinates, orientation, read = read_pose(table, mechanism)
+    pose, coordinates, orientation, read = read_pose(table, mechanism, partial=True)
     used = {joint.name for joint in mechanism.joints} | set(read)
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
     chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates)
     unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
+    lacking = {c.name for c in mechanism.pose} - {c.name for c in coordinates}
     if orientation == "none":
         check_orientation(table, mechanism, unused)
     if learns:
@@ -214,6 +215,9 @@ def load_records(
             f"{table.path}: no input varies: {', '.join(still)} are constant and there is no covariate that changes; "
             "record configurations that differ"
         )
+    if lacking and not (orientation == "none" and len(coordinates) == 3):
+        shown = ", ".join(c.name for c in coordinates)
+        notes.append(f"of the pose only {shown} was measured; what moves nothing else is not seen")
     notes = [
         *(f"joint '{name}' is constant and carries no information" for name in still),
         *notes,

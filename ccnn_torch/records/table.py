@@ -16,7 +16,7 @@ from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import csv_cell, writing_whole
 from ccnn_torch.spelling import nearest
-from ccnn_torch.units import LARGEST, parse_header, split_header, to_si, write_hint
+from ccnn_torch.units import LARGEST, parse_header, si_unit_of, split_header, to_si, write_hint
 
 FILE = "file"
 """The column that numbers the files where there are several: 0, 1, …"""
@@ -127,11 +127,21 @@ class Table:
         return converted
 
     def _remedy(self, name: str, si_unit: str | None) -> str:
-        near = nearest(name, self.names)
+        # A length is never meant for an angle.
+        fitting = [own for own in self.names if si_unit is None or _may_be(self.units[own], si_unit)]
+        near = nearest(name, fitting)
         if near is not None:
             mapped = f'columns: {{"{near}": "{name}[{self.units[near] or si_unit or "unit"}]"}}'
             return f"'{near}' is the nearest there: rename it to '{name}' if it is meant, or write {mapped}"
         return write_hint(name, si_unit)
+
+
+def _may_be(unit: str, si_unit: str) -> bool:
+    """Whether values in this unit, as written, may be of a quantity in that SI unit; so may those without one."""
+    try:
+        return not unit or si_unit_of(unit) == si_unit
+    except InputError:
+        return True
 
 
 def name_lines(

@@ -14,7 +14,7 @@ from torch import Tensor
 from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
 from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap
 from ccnn_torch.display import count_text
-from ccnn_torch.mechanisms import PoseError, SerialArm
+from ccnn_torch.mechanisms import PoseError, as_measured
 from ccnn_torch.records import check_rows, load_records
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.results.base import Length
@@ -73,8 +73,7 @@ def verify_model(
     loaded = load_records(
         records, machine, names, learns=False, columns=columns or there, joint_map=joint_map or counted
     )
-    if isinstance(machine, SerialArm) and loaded.orientation == "none":
-        machine = machine.with_orientation("none")
+    machine = as_measured(machine, loaded.pose_coordinates)
     if not refit_frames:
         check_rows(loaded, machine)
     rows = predict(model, machine, loaded, compensated)

@@ -23,7 +23,7 @@ from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, sp
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, load_mechanism
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Column, Split
@@ -212,8 +212,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     records = load_records(source, mechanism, config.covariates, columns=config.columns, joint_map=config.joint_map)
     doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
-    if isinstance(mechanism, SerialArm) and records.orientation == "none":
-        mechanism = mechanism.with_orientation("none")
+    mechanism = as_measured(mechanism, records.pose_coordinates)
     if isinstance(mechanism, SerialArm) and config.geometry != "none":
         mechanism = mechanism.with_link_frames()
     held = rows_of_test_file(config.split, records.parts)

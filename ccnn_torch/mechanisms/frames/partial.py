@@ -1,0 +1,196 @@
+"""A mechanism of whose pose the instrument shows some coordinates: a probe z, a tracker x, y, z, a level rx, ry."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import Condition, Coordinate
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.machines.serial import SerialArm
+from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.mechanisms.newton import carry_derivative, least_norm
+from ccnn_torch.mechanisms.pose import Frame, frame_gap
+from ccnn_torch.numerics.batching import expand_leading
+from ccnn_torch.numerics.least_squares import levenberg_marquardt
+
+_ROTATION_WEIGHT = 0.04
+# Damping of a search whose solutions are more than one [1].
+_DAMPING = 1e-8
+
+
+class Partial(Mechanism):
+    """A mechanism seen through an instrument that shows some of its pose coordinates.
+
+    Joints and parameters are the mechanism's. Its pose has the coordinates that are measured; `frame` takes the others
+    from the home pose, so that no error is seen in them. Where joints are more than coordinates, `nearest_joints`
+    gives the joints nearest to the guess that reach them.
+
+    Attributes:
+        mechanism: a copy of the mechanism, without hooks.
+        seen: numbers of the coordinates that are measured, among those of the mechanism.
+    """
+
+    def __init__(self, mechanism: Mechanism, pose: Sequence[str]) -> None:
+        """Take the mechanism, and the names of the coordinates that are measured.
+
+        Raises:
+            InputError: none is named, or one that the mechanism's pose has not.
+        """
+        inner = mechanism.with_nominal(mechanism.nominal)
+        names = [c.name for c in inner.pose]
+        strange = [name for name in pose if name not in names]
+        if strange or not pose:
+            what = f"has no pose coordinate '{strange[0]}'" if strange else "needs a pose coordinate that is measured"
+            raise InputError(f"mechanism '{inner.name}' {what}; it has {', '.join(names)}")
+        seen = [k for k, name in enumerate(names) if name in pose]
+        super().__init__(
+            name=inner.name,
+            joints=inner.joints,
+            pose=[inner.pose[k] for k in seen],
+            geometry=inner.geometry,
+            low=inner.low[seen].tolist(),
+            high=inner.high[seen].tolist(),
+            home_pose=inner.home_pose[seen].tolist(),
+            home_joints=inner.home_joints.tolist(),
+        )
+        self.mechanism, self.seen, self.takes = inner, seen, inner.takes
+
+    def _own_file(self) -> dict[str, Any]:
+        keys = {"mechanism": self.mechanism.describe(), "pose": [c.name for c in self.pose]}
+        return {"spec": "partial", "keys": keys}
+
+    def _follow_nominal(self) -> None:
+        self.mechanism.nominal.copy_(self.nominal)
+        self.mechanism._follow_nominal()
+        self.home_joints.copy_(self.mechanism.home_joints)
+        for own in ("home_pose", "low", "high"):
+            getattr(self, own).copy_(getattr(self.mechanism, own)[self.seen])
+
+    def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 6` or `x 3`."""
+        return frame_gap(self.frame(self.forward_kinematics(joints, parameters, pose)), self.frame(pose), 1.0)
+
+    def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
+        """What is seen of samples of the mechanism; `count x p` [SI]."""
+        return self.mechanism.sample_workspace(count, generator)[..., self.seen]
+
+    def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:
+        """Of the mechanism, `count x n` [SI]."""
+        return self.mechanism.sample_joints(count, generator)
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """What is seen of the mechanism's pose of the joints, `... x p` [SI]."""
+        near = None if guess is None else self.filled(guess)
+        return self.mechanism.forward_kinematics(joints, parameters, near)[..., self.seen]
+
+    def frame(self, pose: Tensor) -> Frame:
+        """The mechanism's frame where all that is not seen is as in the home pose."""
+        return self.mechanism.frame(self.filled(pose))
+
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Joints nearest to the guess whose pose has these coordinates, `... x n` [SI]; differentiable."""
+        values = self.resolve(parameters)
+        found = self.nearest_joints(pose, values, guess, _ROTATION_WEIGHT)
+        slope = self._slope(found, values, _ROTATION_WEIGHT)
+        gap = frame_gap(self.frame(self.forward_kinematics(found, values)), self.frame(pose), _ROTATION_WEIGHT)
+        return carry_derivative(found, slope, gap)
+
+    def nearest_joints(
+        self,
+        pose: Tensor,
+        parameters: Tensor | None,
+        guess: Tensor | None,
+        rotation_weight: float,
+        damping: float = 0.0,
+    ) -> Tensor:
+        """See `Mechanism.nearest_joints`; of joints that reach the same the nearest to the guess. No gradient."""
+        values = self.resolve(parameters)
+        anchor = expand_leading(self.home_joints if guess is None else guess, pose, values).detach()
+        ridge = damping * torch.eye(len(self.joints), dtype=torch.float64)
+
+        def residual(q: Tensor, start: Tensor, v: Tensor, x: Tensor) -> Tensor:
+            gap = frame_gap(self.frame(self.forward_kinematics(q, v)), self.frame(x), rotation_weight)
+            return torch.cat([gap, damping * (q - start)], -1) if damping else gap
+
+        def slope(q: Tensor, start: Tensor, v: Tensor, x: Tensor) -> Tensor:
+            rows = self._slope(q, v, rotation_weight)
+            return torch.cat([rows, ridge.expand(*q.shape[:-1], -1, -1)], -2) if damping else rows
+
+        data = tuple(d.detach() for d in (anchor, values, pose))
+        found = levenberg_marquardt(residual, anchor, slope, data, tolerance=1e-10, damping=_DAMPING)
+        if damping == 0 and len(self.joints) > len(self.pose):
+            return least_norm(residual, slope, found, anchor, data)
+        return found.value
+
+    def singular_values(
+        self,
+        joints: Tensor,
+        rotation_weight: float = _ROTATION_WEIGHT,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+    ) -> Tensor:
+        """See `Mechanism.singular_values`; as many as there are coordinates."""
+        return super().singular_values(joints, rotation_weight, parameters, guess)[..., : len(self.seen)]
+
+    def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """All that is finite: what is not seen may be anything; `...`, bool."""
+        return torch.isfinite(pose).all(-1)
+
+    def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
+        """As of the mechanism, in the pose of the joints."""
+        return self.mechanism.skeleton(self.mechanism.forward_kinematics(joints, parameters), joints, parameters)
+
+    def under(self, conditions: Mapping[str, Tensor]) -> Partial:
+        """The mechanism inside under them."""
+        inner = self.mechanism.under(conditions)
+        if inner is self.mechanism:
+            return self
+        twin = copy.copy(self)
+        twin._modules = {**self._modules, "mechanism": inner}
+        return twin
+
+    def lacking(self, conditions: Sequence[str]) -> list[Condition]:
+        """As of the mechanism inside."""
+        return self.mechanism.lacking(conditions)
+
+    def filled(self, pose: Tensor) -> Tensor:
+        """The mechanism's whole pose, with the home pose in what is not seen: of `... x p` the `... x p'` [SI]."""
+        columns = [*self.mechanism.home_pose.expand(*pose.shape[:-1], -1).unbind(-1)]
+        for i, k in enumerate(self.seen):
+            columns[k] = pose[..., i]
+        return torch.stack(columns, -1)
+
+    def _slope(self, joints: Tensor, values: Tensor, rotation_weight: float) -> Tensor:
+        """The Jacobian with its rotation rows weighed, 0 where there is no pose."""
+        rows = torch.nan_to_num(self.jacobian(joints, values))
+        weight = torch.ones(rows.shape[-2], 1, dtype=rows.dtype)
+        weight[3:] = rotation_weight
+        return rows * weight
+
+
+def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate]) -> Mechanism:
+    """The mechanism as records with these pose coordinates show it: itself, an arm by positions alone, or `Partial`.
+
+    Raises:
+        InputError: frames would have to be fitted to rows that show too little of them.
+    """
+    names, whole = [c.name for c in pose], [c.name for c in mechanism.pose]
+    if names == whole or not set(names) < set(whole):
+        return mechanism
+    if isinstance(mechanism, SerialArm) and names == ["x", "y", "z"]:
+        return mechanism.with_orientation("none")
+    unknown = getattr(mechanism, "unknown_frames", ())
+    if unknown:
+        raise InputError(
+            f"of the pose {', '.join(whole)} only {', '.join(names)} was measured, which does not show where the "
+            f"{' and the '.join(unknown)} of {mechanism.name} {'is' if len(unknown) == 1 else 'are'}; give x, y, z as "
+            "well, or a machine whose frames are known"
+        )
+    return Partial(mechanism, names)
