@@ -119,7 +119,7 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
             f"records: they have {records.joints.shape[-1]} joints and {mechanism.name} has {len(mechanism.joints)}; "
             "load them with the mechanism that was measured"
         )
-    mechanism = as_measured(mechanism, records.pose_coordinates)
+    mechanism = as_measured(mechanism, records.pose_coordinates, records.path)
     parameters = None
     if isinstance(mechanism, SerialArm) and mechanism.unknown_frames:
         parameters = fit_frames(mechanism, records.joints, records.pose, columns=records.columns)

@@ -163,7 +163,7 @@ class Mechanism(nn.Module):
     def forward_kinematics(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
-        """Pose of the joints, on the nominal branch.
+        """Pose of the joints, on the nominal branch; of more joints than coordinates (cables) the closest to closing.
 
         Args:
             joints: `... x n` [SI].
@@ -178,6 +178,7 @@ class Mechanism(nn.Module):
             lambda pose, joints, parameters: self.closure(pose, joints, parameters),
             start,
             (joints, self.resolve(parameters)),
+            closest=len(self.joints) > len(self.pose),
         )
 
     def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:

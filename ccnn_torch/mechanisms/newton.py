@@ -19,6 +19,7 @@ def solve(
     start: Tensor,
     data: tuple[Tensor, ...],
     both: Callable[..., tuple[Tensor, Tensor]] | None = None,
+    closest: bool = False,
 ) -> Tensor:
     """The root that damped Newton reaches from `start`.
 
@@ -28,6 +29,7 @@ def solve(
         data: what the closure needs besides x, `... x d` each.
         both: `(x, *data)` -> the closure and its derivative by x, `... x c` and `... x c x k`, which share most of
             their work; by differentiation when not given.
+        closest: take the least squares of a closure that has no root.
 
     Returns:
         `... x k`; NaN in rows without a root. Differentiable in the data by the implicit function theorem (first
@@ -36,7 +38,7 @@ def solve(
     lead = leading_shape(start, *data)
     plain = tuple(d.detach() for d in data)
     found = levenberg_marquardt(closure, start.detach().expand(*lead, start.shape[-1]), None, plain, both=both)
-    root = (2 * found.cost).sqrt() <= _ROOT
+    root = torch.isfinite(found.cost) if closest else (2 * found.cost).sqrt() <= _ROOT
     # A row without a root takes part from its start on, so that its NaN stays out of the others' derivatives.
     x = torch.where(root[..., None], found.value, start.detach())
     if both is None:

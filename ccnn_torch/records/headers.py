@@ -241,13 +241,12 @@ def read_pose(
     form = next((name for name, columns in forms.items() if any(column in table for column in columns)), "none")
     read = (*(c.name for c in position), *forms.get(form, ()))
     if partial:
-        turns = _measured(table, turns, mechanism) if form == "rotation_vector" else turns
         there = _measured(table, position, mechanism)
         position = position if form == "none" and not there else there
-        read = (*(c.name for c in position), *(forms[form] if form not in ("none", "rotation_vector") else ()))
+        read = (*(c.name for c in position), *forms.get(form, ()))
     full = (*position, *turns)
     if form == "rotation_vector":
-        return stack_columns(table, full, _POSE_LIMIT), full, form, tuple(c.name for c in full)
+        return stack_columns(table, full, _POSE_LIMIT), full, form, read
     where = stack_columns(table, position)
     if form == "none":
         return where, position, form, read

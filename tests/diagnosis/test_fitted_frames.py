@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ccnn_torch.diagnosis import diagnose_rows
@@ -91,6 +92,49 @@ def test_a_mistake_is_named_beside_frames_that_nobody_knows(joints: Change, pose
     wrong = replace(here, joints=joints(records.joints[:60]), pose=pose(records.pose[:60, :3]))
     with pytest.raises(InputError, match=said):
         situation_of(wrong, arm)
+
+
+def test_the_wrong_tool_is_named_with_the_right_one() -> None:
+    """The most usual mistake of all: what was measured is another point of the flange than the file says."""
+    keys = load_mechanism(str(DATA / "ur10.yaml")).recipe["keys"]
+    arm = SerialArm(**{**keys, "tool_offset": [0.0, 0.0, 0.11], "orientation": "none", "unknown_frames": ["base"]})
+    joints = arm.sample_joints(60, torch.Generator().manual_seed(0))
+    truth = arm.nominal.clone()
+    truth[-6:-3] = torch.tensor([0.02, 0.0, 0.05], dtype=torch.float64)
+    records = load_records(DATA / "ur10_b_500.csv", load_mechanism(str(DATA / "ur10.yaml")), learns=False)
+    here = {"orientation": "none", "pose_coordinates": records.pose_coordinates[:3]}
+    wrong = replace(records, joints=joints, pose=arm.forward_kinematics(joints, truth), **here)
+    with pytest.raises(
+        InputError, match=r"seems to be at 20.0, -?0.0, 50.0 mm from the flange and not at 0.0, 0.0, 110"
+    ):
+        situation_of(wrong, arm)
+
+
+def _as_fixed_angles(pose: Tensor) -> Tensor:
+    angles = Rotation.from_rotvec(pose[:, 3:].numpy()).as_euler("xyz")
+    return torch.cat([pose[:, :3], torch.from_numpy(angles)], -1)
+
+
+def _inverted(pose: Tensor) -> Tensor:
+    back = rotation_vector_to_matrix(-pose[:, 3:])
+    return torch.cat([-(back @ pose[:, :3, None])[..., 0], -pose[:, 3:]], -1)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_as_fixed_angles, "Euler angles and no rotation vector: name them fanuc_w, fanuc_p, fanuc_r"),
+        (_inverted, "the pose seems to be inverted"),
+    ],
+)
+def test_a_pose_of_another_kind_is_named(change: Change, said: str) -> None:
+    arm = load_mechanism(str(DATA / "ur10.yaml"))
+    assert isinstance(arm, SerialArm)
+    records = load_records(DATA / "ur10_b_500.csv", arm, learns=False)
+    joints = arm.sample_joints(60, torch.Generator().manual_seed(0))
+    pose = change(arm.forward_kinematics(joints))
+    with pytest.raises(InputError, match=said):
+        situation_of(replace(records, joints=joints, pose=pose), arm)
 
 
 def test_the_base_of_a_framed_machine_is_fitted_first_without_outliers() -> None:

@@ -12,21 +12,25 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.residual.distance import USUAL, Size, distance
 from ccnn_torch.diagnosis.residual.rows import picked
-from ccnn_torch.effects import Situation
+from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox, Framed, SerialArm
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form, fit_frames
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+from ccnn_torch.records.headers import EULER_ANGLES
 
 # A mistake is named where without it so small a share of the distance is left.
 _MENDED = 0.1
 _FEW = 40
 # Rows that have to be far off before their order is questioned.
 _FEWEST_LATE = 8
+_TOLD = 2
 # Mistakes that leave no more than this many times the least are as likely.
 _ALIKE = 1.2
 # Distance in sizes of the machine that a row without a pose counts as.
 _UNREACHED = 10.0
 _TURN = 180 / torch.pi
+_POSE = ("x", "y", "z", "rx", "ry", "rz")
 # Share of the usual distance that a fitted frame may leave.
 _LEFT = 0.1
 
@@ -36,6 +40,7 @@ def what_is_wrong(situation: Situation, measured: Tensor, size: Size) -> str:
     return (
         late_rows(situation, measured, size, anew=True)
         or mistake(situation, measured, size, anew=True)
+        or tool_remedy(situation, measured, size)
         or frame_remedy(situation, measured, size)
     )
 
@@ -48,15 +53,17 @@ def mistake(situation: Situation, measured: Tensor, size: Size, anew: bool = Fal
     rows = torch.linspace(0, len(measured) - 1, min(_FEW, len(measured))).round().long()
     here, poses = picked(situation, rows), measured[rows]
     # A row that the machine does not reach is off by its whole workspace, and more.
-    before = float(_far(here, poses, size).median())
+    before = min(float(_far(here, poses, size, fitted).median()) for fitted in {False, anew})
     found = []
     for words, other, there in _mistakes(here, poses):
+        if other is here and torch.equal(there.nan_to_num(), poses.nan_to_num()):
+            continue
         left = float(_far(other, there, size, anew).median())
         if left < min(_MENDED * before, USUAL):
-            found.append((left, words))
+            found.append((left, f"{words}, which leaves {_remainder(other, there, anew)}"))
     # On a machine that is its own mirror image two mistakes may come to the same.
     least = min((left for left, _ in found), default=0.0)
-    return ", or ".join(words for left, words in found if left <= _ALIKE * least)
+    return ", or ".join(words for left, words in sorted(found)[:_TOLD] if left <= _ALIKE * least)
 
 
 def late_rows(situation: Situation, measured: Tensor, size: Size, anew: bool = False) -> str:
@@ -100,6 +107,7 @@ def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Sit
     yield words, situation, measured - shift
     turned = torch.where(lengths, measured, measured / _TURN)
     yield "the pose's angles seem to be in degrees under rad", situation, turned
+    yield from _orientations(situation, measured)
     for i, one in enumerate(pose):
         yield f"{one.name} of the pose seems to be reversed", situation, _reversed(measured, i)
     for i, k in combinations(range(len(pose)), 2):
@@ -130,6 +138,36 @@ def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Sit
     for factor, words in ((1e-3, "millimetres under m"), (1e3, "metres under mm")):
         scaled = torch.where(angles, at, factor * at)
         yield f"the joints seem to be in {words}", replace(situation, joints=scaled), measured
+
+
+def _orientations(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Situation, Tensor]]:
+    """Of poses x, y, z, rx, ry, rz: Euler angles that were taken for a rotation vector, and inverted transforms."""
+    if [c.name for c in situation.mechanism.pose] != [*_POSE]:
+        return
+    # Imported here: few rows need it, and the import takes long.
+    from scipy.spatial.transform import Rotation
+
+    finite = measured.nan_to_num()
+    place, angles = finite[..., :3], finite[..., 3:]
+    for columns, axes in EULER_ANGLES.values():
+        if axes == "ZYX":
+            # The same as about fixed axes, in the other order.
+            continue
+        vector = torch.from_numpy(Rotation.from_euler(axes, angles.numpy()).as_rotvec())
+        words = f"rx, ry, rz seem to be Euler angles and no rotation vector: name them {', '.join(columns)}"
+        yield words, situation, torch.cat([place, vector], -1)
+    back = rotation_vector_to_matrix(-angles)
+    inverse = torch.cat([-(back @ place[..., None])[..., 0], -angles], -1)
+    words = "the pose seems to be inverted: that of the base in the tool's axes, as a camera on the hand sees a board"
+    yield words, situation, inverse
+
+
+def _remainder(situation: Situation, measured: Tensor, anew: bool) -> str:
+    """What the usual row is off by in position, or where that is not measured in orientation."""
+    other = placed(situation, measured) if anew else situation
+    residual = pose_residual(replace(other, guess=None if situation.guess is None else measured), measured)
+    place, turn = (float(part.norm(dim=-1).nanmedian()) for part in (residual[:, :3], residual[:, 3:]))
+    return f"{1e3 * place:.3g} mm" if place > 0 else f"{1e3 * turn:.3g} mrad"
 
 
 def _far(situation: Situation, measured: Tensor, size: Size, anew: bool = False) -> Tensor:
@@ -192,6 +230,30 @@ def frame_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
     if float(left.median()) > _LEFT * USUAL:
         return ""
     return f"seen from a frame that is not the model's they are; to have it fitted write {key}"
+
+
+def tool_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
+    """What to write where the measured point is elsewhere on the flange of an arm than its file says; else empty."""
+    arm, finite = situation.mechanism, torch.isfinite(measured).all(-1)
+    if not isinstance(arm, SerialArm) or "tool" in arm.unknown_frames or _grouped(arm):
+        return ""
+    joints, measured = situation.joints[finite], measured[finite]
+    if len(joints) < _FEWEST_LATE:
+        return ""
+    keys = arm.recipe["keys"]
+    unknown = {"unknown_frames": (*arm.unknown_frames, "tool")}
+    free = {"tool_offset": "unknown"} if arm.orientation == "none" else unknown
+    values = fit_frames(SerialArm(**{**keys, **free}), joints, measured)
+    error = arm.pose_error(arm.forward_kinematics(joints, values), measured)
+    before = arm.pose_error(arm.forward_kinematics(joints, situation.parameters), measured)
+    left = float(error.position.median())
+    if left > min(_MENDED * float(before.position.median()), _LEFT * USUAL * float(size.place)):
+        return ""
+    there, own = (", ".join(f"{1e3 * float(v):.1f}" for v in tool) for tool in (values[-6:-3], arm.nominal[-6:-3]))
+    return (
+        f"the measured point seems to be at {there} mm from the flange and not at {own} mm, which leaves "
+        f"{1e3 * left:.3g} mm; correct tool_offset in its file, or write tool_offset: unknown to have it fitted"
+    )
 
 
 def _grouped(arm: SerialArm) -> bool:

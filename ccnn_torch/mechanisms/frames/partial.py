@@ -175,8 +175,11 @@ class Partial(Mechanism):
         return rows * weight
 
 
-def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate]) -> Mechanism:
+def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "records") -> Mechanism:
     """The mechanism as records with these pose coordinates show it: itself, an arm by positions alone, or `Partial`.
+
+    Args:
+        where: the file, which opens the sentence.
 
     Raises:
         InputError: frames would have to be fitted to rows that show too little of them.
@@ -189,7 +192,7 @@ def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate]) -> Mechanism:
     unknown = getattr(mechanism, "unknown_frames", ())
     if unknown:
         raise InputError(
-            f"of the pose {', '.join(whole)} only {', '.join(names)} was measured, which does not show where the "
+            f"{where}: of the pose {', '.join(whole)} only {', '.join(names)} was measured, which does not show where the "
             f"{' and the '.join(unknown)} of {mechanism.name} {'is' if len(unknown) == 1 else 'are'}; give x, y, z as "
             "well, or a machine whose frames are known"
         )
