@@ -102,10 +102,10 @@ def test_the_wrong_tool_is_named_with_the_right_one() -> None:
     truth = arm.nominal.clone()
     truth[-6:-3] = torch.tensor([0.02, 0.0, 0.05], dtype=torch.float64)
     records = load_records(DATA / "ur10_b_500.csv", load_mechanism(str(DATA / "ur10.yaml")), learns=False)
-    here = {"orientation": "none", "pose_coordinates": records.pose_coordinates[:3]}
-    wrong = replace(records, joints=joints, pose=arm.forward_kinematics(joints, truth), **here)
+    here = replace(records, orientation="none", pose_coordinates=records.pose_coordinates[:3])
+    wrong = replace(here, joints=joints, pose=arm.forward_kinematics(joints, truth))
     with pytest.raises(
-        InputError, match=r"seems to be at 20.0, -?0.0, 50.0 mm from the flange and not at 0.0, 0.0, 110"
+        InputError, match=r"seems to be at 20.0, -?0.0, 50.0 mm from the flange and not at 0.0, 0.0, 11"
     ):
         situation_of(wrong, arm)
 

@@ -192,8 +192,8 @@ def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "
     unknown = getattr(mechanism, "unknown_frames", ())
     if unknown:
         raise InputError(
-            f"{where}: of the pose {', '.join(whole)} only {', '.join(names)} was measured, which does not show where the "
-            f"{' and the '.join(unknown)} of {mechanism.name} {'is' if len(unknown) == 1 else 'are'}; give x, y, z as "
-            "well, or a machine whose frames are known"
+            f"{where}: of the pose {', '.join(whole)} only {', '.join(names)} was measured, which does not show where "
+            f"the {' and the '.join(unknown)} of {mechanism.name} {'is' if len(unknown) == 1 else 'are'}; give x, y, z "
+            "as well, or a machine whose frames are known"
         )
     return Partial(mechanism, names)
