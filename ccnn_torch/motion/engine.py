@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis.verdict.text import verdict_text
 from ccnn_torch.evidence.shrink import draws
 from ccnn_torch.motion.content import effects_of, floor_of, hidden_of, notes_of, where_is
 from ccnn_torch.motion.effects import motion_effects
-from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
+from ccnn_torch.motion.effects.bodies import STANDARD_GRAVITY
 from ccnn_torch.motion.fit import ALONE
 from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import torch
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.effects.own_parameter import OWN
-from ccnn_torch.motion.effects.payload import CARRIED
+from ccnn_torch.motion.effects.bodies import CARRIED
+from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.engine import MotionDiagnosis
 from ccnn_torch.motion.models import nominal_of
 from ccnn_torch.motion.nominal import Nominal

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ccnn_torch.motion.effects import Facts, MotionEffect, Number
 from ccnn_torch.motion.effects.checked import refuse_wrong_effect
-from ccnn_torch.motion.effects.cogging import FEWEST
-from ccnn_torch.motion.effects.own_parameter import OWN
+from ccnn_torch.motion.effects.gears import FEWEST
+from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.stage import ABSENT
 
 # What may not be below 0, and what not above.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.motion.effects import MotionEffect
-from ccnn_torch.motion.effects.own_parameter import own_parameter
+from ccnn_torch.motion.effects.registry import own_parameter
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.simulators import Simulator
 from ccnn_torch.motion.stretches import Stretches

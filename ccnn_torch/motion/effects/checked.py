@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.effects.own_parameter import OWN
-from ccnn_torch.motion.effects.payload import CARRIED
+from ccnn_torch.motion.effects.bodies import CARRIED
 from ccnn_torch.motion.effects.protocol import Act, Facts, MotionEffect, Number
+from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.spelling import nearest
 
