@@ -6,16 +6,20 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.checks.identifiable import Check
-from ccnn_torch.diagnosis.page.arrays import picture_arrays
 from ccnn_torch.diagnosis.page.data import CORRECTED, RESULT
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
 from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.shrink.held_out import held_out
 from ccnn_torch.diagnosis.verdict.text import noise_text
+from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames
@@ -91,3 +95,223 @@ def write_corrected(folder: Path, diagnosis: Diagnosis) -> None:
     nominal = dict(zip(names, before.tolist(), strict=True))
     maps = [(diagnosis.machine or {}).get(key) for key in ("columns", "joint_map")]
     write_machine(machine, nominal, folder, Path(CORRECTED[0]).stem, *maps)
+
+
+Column = tuple[str, str, Tensor]
+"""Name, SI unit and values."""
+# Quantile bins of a driver; the one whose bins hold most of an effect's variance is the signature of the effect.
+_BINS = 12
+_UNITS = {"time": "s", "temperature": "K"}
+# A driver outside the library that is one column by its name.
+_COLUMN = {"temperature": "temperature", "time": "time"}
+
+
+def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """What the report draws.
+
+    Args:
+        diagnosis: with its analysis.
+        seed: of the folds, as in the diagnosis.
+
+    Returns:
+        Arrays by name (`s` rows, `c` pose channels, SI): `place` `s x 3`, `joints` `s x n`, `residual` and `remainder`
+        `s x c`, all in the robot's frame; the machine's legs or links, `machine.NAME` `k x 3`; `noise` `c`, `held_out`
+        and `set_aside` `s`, `covariate.NAME` `s`, and for each effect of the verdict and the driver outside the library
+        `signature.NAME.x`, `.y` and `.fit` `s`. The remainder of each row is that of a fit to other rows. And
+        the names and units of the signatures' axes, `{NAME: {"x": {"name", "unit"}, …}}`.
+    """
+    analysis = diagnosis.analysis
+    situation = analysis.situation
+    found = diagnosis.judgement.found
+    keep = analysis.whitening.keep()
+    held = torch.zeros(len(situation.joints), dtype=torch.float64)
+    held[keep] = 1.0
+    place = situation.mechanism.frame(analysis.measured)[0]
+    # The analysis' own residual is about the machine with the effects.
+    residual = pose_residual(situation, analysis.measured)
+    remainder = _remainder(analysis, residual, found.members, seed)
+    inside, drawn, left = _in_robot_frame(situation, torch.nan_to_num(place), residual, remainder)
+    arrays = {
+        "place": inside,
+        "joints": situation.joints,
+        "residual": drawn,
+        "remainder": left,
+        "noise": _spread(analysis, (analysis.whitening.sigma * analysis.floor**0.5)[None])[0],
+        "held_out": held,
+        "set_aside": 1 - held,
+    }
+    arrays |= _machine(situation, inside, keep)
+    arrays |= {f"covariate.{name}": value for name, value in situation.covariates.items()}
+    labels: dict[str, Any] = {}
+    parts = [analysis.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
+    columns = _drivers(analysis, place)
+    shown = set(diagnosis.verdict["effects"]) | set(diagnosis.judgement.drivers)
+    # What the whole set leaves, discrepancy term and all: the signature of one cause is drawn with all others taken
+    # off.
+    left = _remainder(analysis, residual, found.members, seed, with_discrepancies=True)
+    for i, part in zip(found.members, parts, strict=True):
+        name = analysis.atoms[i].name
+        if name not in shown or not bool((part[keep] != 0).any()):
+            continue
+        # In the pose and in the joints; what follows one column best shows the cause best.
+        views = [_along(part, left, keep, columns), _in_joints(analysis, part, left, columns)]
+        scores = [_telling(view, keep, name) for view in views]
+        view, (_, (x_name, x_unit, x)) = max(zip(views, scores, strict=True), key=lambda pair: pair[1][0])
+        fit, rest, y_axis = view.fit, view.rest, {"name": view.axis.name, "unit": view.axis.unit}
+        arrays |= {f"signature.{name}.x": x, f"signature.{name}.y": fit + rest, f"signature.{name}.fit": fit}
+        labels[name] = {"x": {"name": x_name, "unit": x_unit}, "y": y_axis}
+    return {name: value.to(torch.float64) for name, value in arrays.items()}, labels
+
+
+def _in_robot_frame(
+    situation: Situation, place: Tensor, residual: Tensor, remainder: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Places `s x 3` and residuals `s x c0` in the robot's frame, wherever the measuring device stands."""
+    arm = situation.mechanism
+    if not isinstance(arm, SerialArm):
+        return place, residual, remainder
+    vectors = torch.stack([residual, remainder], 1).reshape(len(place), -1, 3)
+    place, vectors = arm.in_own_base(place, vectors, situation.parameters)
+    residual, remainder = vectors.reshape(len(place), 2, -1).unbind(1)
+    return place, residual, remainder
+
+
+def _machine(situation: Situation, place: Tensor, keep: Tensor) -> dict[str, Tensor]:
+    """The machine's legs or links, `machine.NAME` `k x 3` [m], in the row next to the middle of all."""
+    here = place[keep]
+    row = int(keep[(here - here.median(0).values).square().sum(-1).argmin()])
+    parameters = situation.parameters
+    values = None if parameters is None else parameters.expand(len(place), -1)[row]
+    lines = situation.mechanism.skeleton(situation.pose[row], situation.joints[row], values)
+    return {f"machine.{name}": line for name, line in lines.items()}
+
+
+def _spread(analysis: Analysis, values: Tensor) -> Tensor:
+    """Values of the channels that count, `s x c`, among all channels, `s x c0`; the others are 0."""
+    out = values.new_zeros(len(values), analysis.residual.shape[-1])
+    out[:, analysis.whitening.channels] = values
+    return out
+
+
+def _remainder(
+    analysis: Analysis, residual: Tensor, members: tuple[int, ...], seed: int, *, with_discrepancies: bool = False
+) -> Tensor:
+    """What a set's effects leave of each row by a fit to others, `s x c0`; the residual where a row is set aside."""
+    atoms = analysis.atoms
+    chosen = [i for i in members if with_discrepancies or not atoms[i].is_discrepancy]
+    out = residual.clone()
+    keep = analysis.whitening.keep()
+    out[keep] = _spread(analysis, held_out(analysis, [chosen], seed)[0].left)
+    return out
+
+
+class _View(NamedTuple):
+    """One way to look at an effect: its fitted part and what is left, `s` each, on an axis; and what may drive it."""
+
+    axis: Coordinate
+    fit: Tensor
+    rest: Tensor
+    drivers: list[Column]
+
+
+def _along(part: Tensor, left: Tensor, keep: Tensor, columns: list[Column]) -> _View:
+    """Along the direction in which the effect moves the pose most."""
+    direction, unit = _direction(part[keep])
+    return _View(Coordinate(_direction_words(direction), unit), part @ direction, left @ direction, columns)
+
+
+def _in_joints(analysis: Analysis, part: Tensor, left: Tensor, columns: list[Column]) -> _View:
+    """In the joint that the effect moves most; 0 where a row was set aside for a singularity.
+
+    A deviation of the joints looks the same everywhere in the workspace, what it does to the pose does not.
+    """
+    channels, sigma = analysis.whitening.channels, analysis.whitening.sigma
+    jacobian = analysis.situation.jacobian
+    keep = torch.nonzero(~analysis.near_singular & jacobian.isfinite().flatten(1).all(-1)).flatten()
+    slope = jacobian[keep][:, channels] / sigma[:, None]
+    both = torch.stack([part, left], -1)[keep][:, channels] / sigma[:, None]
+    # More joints than channels leave a choice, of which the smallest is taken.
+    found = torch.linalg.pinv(slope, rtol=1e-9) @ both
+    found = part.new_zeros(len(part), slope.shape[-1], 2).index_copy(0, keep, found)
+    # Joints of several units are weighed by what a unit of each does to the pose.
+    reach = slope.square().sum(1).mean(0).sqrt()
+    joint = int((found[..., 0].square().mean(0).sqrt() * reach).argmax())
+    axis = analysis.situation.mechanism.joints[joint]
+    drivers = [*columns, *_torques(analysis, axis)]
+    return _View(Coordinate(f"deviation of {axis.name}", axis.unit), found[:, joint, 0], found[:, joint, 1], drivers)
+
+
+def _torques(analysis: Analysis, joint: Coordinate) -> list[Column]:
+    """What load and weight ask of a joint, as further things that may give an effect on it away."""
+    situation = analysis.situation
+    i = [c.name for c in situation.mechanism.joints].index(joint.name)
+    turns = joint.unit == "rad"
+    found = [(f"pull of the weight on {joint.name}", "m" if turns else "1", situation.weight_torque[:, i])]
+    if situation.loaded:
+        name = f"{'torque' if turns else 'force'} of the load on {joint.name}"
+        found.append((name, "N*m" if turns else "N", situation.load_torque[:, i]))
+    return found
+
+
+def _direction(part: Tensor) -> tuple[Tensor, str]:
+    """The direction in which an effect moves the pose most, `c0`: in position, or in rotation where only that moves."""
+    moving = part[:, :3].abs().amax() > 0
+    block = part[:, :3] if moving else part[:, 3:]
+    main = torch.linalg.svd(block, full_matrices=False)[2][0]
+    main = main * torch.sign(main[main.abs().argmax()])
+    direction = torch.zeros_like(part[0])
+    direction[: 3 if moving else None] = main if moving else 0.0
+    if not moving:
+        direction[3:] = main
+    return direction, "m" if moving else "rad"
+
+
+def _direction_words(direction: Tensor) -> str:
+    kind, values = ("residual", direction[:3]) if bool(direction[:3].any()) else ("turn", direction[3:])
+    near = int(values.abs().argmax())
+    if float(values.abs()[near]) > 0.99:
+        return f"{kind} along {'xyz'[near]}"
+    return f"{kind} along ({', '.join(f'{float(v):.2f}' for v in values)})"
+
+
+def _drivers(analysis: Analysis, place: Tensor) -> list[Column]:
+    """What may give an effect away: covariates, joints, place; name, unit and values of each."""
+    situation = analysis.situation
+    found = [(name, _unit(name), value) for name, value in situation.covariates.items()]
+    found += [(c.name, c.unit, situation.joints[:, i]) for i, c in enumerate(situation.mechanism.joints)]
+    return [*found, *(("xyz"[i], "m", place[:, i]) for i in range(3))]
+
+
+def _unit(name: str) -> str:
+    if name.startswith("load_"):
+        return "N*m" if name.startswith("load_r") else "N"
+    return _UNITS.get(name, "1")
+
+
+def _telling(view: _View, keep: Tensor, cause: str) -> tuple[float, Column]:
+    """The column that a cause follows, and how well: the one that its name says, else the one that it follows best."""
+    kind, _, which = cause.partition(" ")
+    wanted = {"joint": which, "load": f"load_{which}", "direction": f"direction{which}"}.get(kind, _COLUMN.get(cause))
+    named = [c for c in view.drivers if c[0] == wanted] or view.drivers
+    shares = [_share(c[2][keep], view.fit[keep]) for c in named]
+    best = max(range(len(named)), key=lambda i: shares[i])
+    return shares[best], named[best]
+
+
+def _share(x: Tensor, fit: Tensor) -> float:
+    """Share of the variance of `fit` between quantile bins of `x`, both `s`."""
+    known = torch.isfinite(x + fit)
+    x, fit = x[known], fit[known]
+    values = torch.unique(x)
+    if len(values) < 2:
+        return 0.0
+    edges = (
+        values[1:] if len(values) <= _BINS else torch.quantile(x, torch.linspace(0, 1, _BINS + 1, dtype=x.dtype))[1:-1]
+    )
+    bins = torch.bucketize(x.contiguous(), edges, right=True)
+    count = torch.zeros(_BINS + 1, dtype=x.dtype).index_add(0, bins, torch.ones_like(x))
+    total = torch.zeros(_BINS + 1, dtype=x.dtype).index_add(0, bins, fit - fit.mean())
+    between = float((total.square() / count.clamp_min(1)).sum())
+    # A bin takes up some of any variance by chance: each costs its share.
+    whole = float((fit - fit.mean()).square().sum())
+    return between / whole - len(edges) / len(x) if whole > 0 else 0.0

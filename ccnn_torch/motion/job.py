@@ -8,7 +8,7 @@ from typing import Any
 
 from ccnn_torch.config.sizes import size
 from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
-from ccnn_torch.diagnosis.page.compensate import typed_path
+from ccnn_torch.diagnosis.job import typed_path
 from ccnn_torch.diagnosis.page.data import NEXT, RESULT, about_of, load_labels
 from ccnn_torch.diagnosis.page.report import print_diagnosis, write_diagnosis_report
 from ccnn_torch.diagnosis.progress import watched

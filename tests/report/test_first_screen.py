@@ -8,9 +8,7 @@ import pytest
 from diagnosis_cases import CASES, indistinguishable, none, one_effect, outlier, outside, two_effects
 
 from ccnn_torch.diagnosis.page.data import About, about_of
-from ccnn_torch.diagnosis.page.first_screen import first_screen
-from ccnn_torch.diagnosis.page.numbers import numbers_table
-from ccnn_torch.diagnosis.page.place_words import where_words
+from ccnn_torch.diagnosis.page.first_screen import first_screen, numbers_table, where_words
 from ccnn_torch.diagnosis.verdict.findings import findings, frequency_words, places, size_words
 from ccnn_torch.effects import EFFECTS, OUTLIER
 from ccnn_torch.effects.words import words_of

@@ -1,4 +1,4 @@
-"""From `diagnosis.json` and its arrays to everything that is read: terminal, Markdown, pictures, one HTML page."""
+"""From `diagnosis.json` and its arrays to terminal, Markdown, pictures and one HTML page; and that of `ccnn check`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
 
+from ccnn_torch.diagnosis.checks.identifiable import Check
 from ccnn_torch.diagnosis.page.data import (
     ARRAYS,
     CORRECTED,
@@ -24,18 +25,22 @@ from ccnn_torch.diagnosis.page.data import (
     used_rows,
 )
 from ccnn_torch.diagnosis.page.first_screen import ON_SCREEN, first_screen
-from ccnn_torch.diagnosis.page.localisation import aside_table, next_table, region_table, where_table, write_next_csv
 from ccnn_torch.diagnosis.page.tables import (
+    aside_table,
     confusable_table,
     effect_table,
     gap_table,
+    next_table,
     order_table,
     parameter_table,
     record_table,
+    region_table,
     unseen_table,
+    where_table,
+    write_next_csv,
 )
 from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, unseen_text, verdict_text
-from ccnn_torch.display import count_text
+from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.arrays import load_tensors, save_tensors
 from ccnn_torch.report.json_files import read_json, write_json
@@ -171,11 +176,8 @@ def _print_tables(results: Block, console: Console, about: About) -> None:
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
-    from ccnn_torch.diagnosis.page.figure_course import course_plot
-    from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
-    from ccnn_torch.diagnosis.page.figure_machine import machine_plot
-    from ccnn_torch.diagnosis.page.figure_signature import signature_plot
-    from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
+    from ccnn_torch.diagnosis.page.figure_rows import machine_plot, signature_plot
+    from ccnn_torch.diagnosis.page.figures import course_plot, gap_plot, probability_plot, remainder_map, where_plot
 
     effects = list(results["verdict"]["effects"])
     plots = (
@@ -227,3 +229,45 @@ def _facts(results: Block, arrays: Arrays, about: About) -> str:
     if results["rows_set_aside"]:
         facts.append(f"{len(results['rows_set_aside'])} set aside")
     return " · ".join(facts)
+
+
+# Confusable effects shown for each effect.
+_LIKEST = 3
+
+
+def check_text(check: Check) -> list[str]:
+    """What the records can and cannot show, one sentence a line."""
+    noise = ", ".join(f"{n} {_in_unit(s, 'rad' if n.startswith('r') else 'm')}" for n, s in check.noise.items())
+    lines = [
+        f"{check.rows} rows, {len(check.aside)} of them set aside; Jacobian's condition number up to "
+        f"{check.condition:.3g}.",
+        f"Noise, {'as given' if check.noise_given else 'estimated'}: {noise}.",
+        f"Covariates: {', '.join(check.covariates) or 'none'}.",
+    ]
+    lines += [aside_text(check.aside, check.why_aside, check.lines_aside)] if check.aside else []
+    lines += [f"{remark}." for remark in check.remarks]
+    lines += [f"Caution: {caution}." for caution in check.cautions]
+    lines += [f"{name} cannot be seen without {why}." for name, why in check.missing.items()]
+    lines += [f"{name} could hide: its plausible size is {size:.2g} of the noise." for name, size in check.weak.items()]
+    return lines
+
+
+def _in_unit(value: float, unit: str) -> str:
+    scale, shown = display_unit(unit, value)
+    return f"{number_text(value / scale, 2)} {shown}"
+
+
+def check_table(check: Check) -> Table:
+    """What could take over each effect on these rows, the closest first."""
+    found: dict[str, list[str]] = {}
+    for first, second, share in check.confusable:
+        found.setdefault(first, []).append(f"{second} {share:.3f}")
+    rows = tuple(
+        (name, ", ".join(others[:_LIKEST]) + (f" and {more} more" if (more := len(others) - _LIKEST) > 0 else ""))
+        for name, others in found.items()
+    )
+    note = (
+        "Cosine between what an effect is likely to do and what another can do. A diagnosis still distinguishes them "
+        "where the other one needs implausible or more coefficients; all pairs are in check.json (--out)."
+    )
+    return Table("Confusable", ("effect", "taken over by"), rows, note, ("taken over by",))
