@@ -13,8 +13,9 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.checks.identifiable import Check
-from ccnn_torch.diagnosis.page.data import CORRECTED, RESULT
+from ccnn_torch.diagnosis.page.data import CORRECTED, NEXT, RESULT, about_of
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
+from ccnn_torch.diagnosis.page.tables import write_next_csv
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
@@ -70,7 +71,9 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
     lines = [diagnosis.lines[row] for row in diagnosis.rows_set_aside] if diagnosis.lines else []
     noise = noise_text(diagnosis.noise)
     labels = labels | {"about": {"noise": noise, **(about or {}), "units": units, "lines": lines}}
-    write_diagnosis_report(folder, plain(diagnosis.to_json()), arrays, labels)
+    results = plain(diagnosis.to_json())
+    write_next_csv(folder / NEXT, results, about_of(labels))
+    write_diagnosis_report(folder, results, arrays, labels)
     return path
 
 

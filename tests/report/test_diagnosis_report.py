@@ -34,6 +34,7 @@ from ccnn_torch.diagnosis.page.tables import (
     region_table,
     shares,
     where_table,
+    write_next_csv,
 )
 from ccnn_torch.diagnosis.verdict.text import (
     aside_text,
@@ -56,6 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("diagnosis")
     results, arrays, labels = indistinguishable()
     write_json(folder / "diagnosis.json", results)
+    write_next_csv(folder / "next_measurements.csv", results, about_of(labels))
     write_diagnosis_report(folder, results, arrays, labels)
     return folder
 

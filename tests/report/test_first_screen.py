@@ -136,6 +136,10 @@ def test_what_to_do_now_names_files_columns_and_commands() -> None:
 def test_nothing_bad_rows_and_what_is_outside_are_said() -> None:
     assert _told(none()[0])["What is wrong"].startswith("Nothing: model and machine differ by no more than the noise")
     assert "What it removes" not in _told(none()[0])
+    doubted = none()[0] | {"noise": "estimated"}
+    assert _told(doubted)["What is wrong"] == "Nothing beyond what is taken for noise."
+    doubted["verdict"]["probability"] = 0.4
+    assert _told(doubted)["What is wrong"] == "Nothing that these rows determine."
     bad = _told(outlier()[0])
     assert bad["What is wrong"] == "2 bad rows." and not {"Where", "What it removes"} & set(bad)
     wrong = _told(outside()[0])["What is wrong"]

@@ -25,6 +25,7 @@ from ccnn_torch.diagnosis.verdict.text import (
     probability_words,
     size_text,
     undetermined,
+    words_for,
 )
 from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.effects import OUTLIER
@@ -66,9 +67,9 @@ def _wrong(results: Block) -> str:
     if verdict["none"]:
         if open_:
             return f"{capital(open_)}; the likeliest: nothing beyond the noise."
-        if results.get("motion") and verdict["probability"] <= 0.5:
-            return "Nothing that these logs determine."
-        if results.get("motion") and in_doubt(results):
+        if verdict["probability"] <= 0.5:
+            return f"Nothing that these {words_for(results).rows} determine."
+        if in_doubt(results):
             return "Nothing beyond what is taken for noise."
         return "Nothing: model and machine differ by no more than the noise."
     if verdict["outside_library"] or not found:
@@ -91,15 +92,13 @@ def _removed(results: Block) -> str:
     verdict, gap, far = results["verdict"], results["gap"], results.get("by_block")
     if not verdict["effects"] or verdict["effects"] == [OUTLIER] or gap["before"] is None or gap["after"] is None:
         return ""
-    rows = "runs not used for fitting" if results.get("motion") else "rows at random"
-    text = f"{size_text(gap['before'], gap)} → {size_text(gap['after'], gap)} on {rows}"
-    if results.get("motion"):
-        pass
-    elif far is not None:
+    words = words_for(results)
+    text = f"{size_text(gap['before'], gap)} → {size_text(gap['after'], gap)} on {words.unseen}"
+    if far is not None:
         before, after = (size_text(far[key], far) for key in ("before", "after"))
         text += f", {before} → {after} where nothing was measured (by block)"
     else:
-        text += "; not known where nothing was measured"
+        text += words.elsewhere
     known = "estimated at" if results.get("noise") == "estimated" else "is"
     floor = f"; the noise {known} {size_text(gap['noise_floor'], gap)}" if gap["noise_floor"] else ""
     network = results.get("network") or {}

@@ -37,7 +37,6 @@ from ccnn_torch.diagnosis.page.tables import (
     region_table,
     unseen_table,
     where_table,
-    write_next_csv,
 )
 from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text, display_unit, number_text
@@ -64,7 +63,7 @@ def write_diagnosis_report(
     arrays: Mapping[str, Tensor] | None = None,
     labels: Block | None = None,
 ) -> Path:
-    """Write `report.html`, `diagnosis.md`, `next_measurements.csv` and `plots/`.
+    """Write `report.html`, `diagnosis.md` and `plots/`.
 
     The same files give the same report, so it can be written again at any time. A picture or a table whose numbers are
     not there is left out.
@@ -92,8 +91,6 @@ def write_diagnosis_report(
         write_json(folder / LABELS, labels or {})
     numbers, labels = load_tensors(folder / ARRAYS)[0], load_labels(folder)
     about = about_of(labels)
-    if not results.get("motion"):
-        write_next_csv(folder / NEXT, results, about)
     # Here, so that `ccnn check` and the verdict on the terminal do not wait for matplotlib.
     from ccnn_torch.report.figures.style import inline_figures
 

@@ -18,6 +18,7 @@ from ccnn_torch.diagnosis.verdict.text import (
     listed,
     network_text,
     probability_words,
+    words_for,
 )
 from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.report.csv_file import write_rows
@@ -55,13 +56,12 @@ def gap_table(results: Block, about: About) -> Table:
         ratio = block["before"] / block["noise_floor"] if block["noise_floor"] and block["before"] is not None else None
         rows.append((f"{name} [{unit}]", *sizes, number_text(ratio, 3), percent(block["reducible_share"])))
     columns = ("gap", "before", "after", floor_words(results), "before / noise [1]", "above the noise [%]")
+    of = words_for(results).place
     note = (
-        "RMS over the data not used for fitting of the distance between measured and modelled pose; after: with the "
+        f"RMS over the data not used for fitting of the distance between measured and modelled {of}; after: with the "
         "effects of the verdict in the model; above the noise: share of the mean square that a better model could "
         "remove."
     )
-    if results.get("motion"):
-        note = note.replace("pose;", "position;")
     return Table("How large is the gap?", columns, rows, f"{note} {about.noise}".rstrip())
 
 
@@ -345,7 +345,7 @@ def next_table(results: Block, about: About) -> Table | None:
     wanted = results["next_measurements"]
     if not wanted:
         return None
-    if results.get("motion"):
+    if "motion" in wanted[0]:
         return _next_motion_table(wanted)
     joints, covariates = _columns(results)
     rows = []
