@@ -72,7 +72,7 @@ def diagnose(
             situation, records.pose, noise_of(noise, situation), effects, seed, _instrument(records, situation)
         )
     notes = [*said.notes, *_unread(records, situation, said)]
-    said = replace(said, lines=tuple(records.lines.tolist()), notes=notes, machine=named_machine(said))
+    said = replace(said, lines=tuple(records.lines.tolist())).with_entries(notes=notes, machine=named_machine(said))
     return with_network(said, seed) if network else said
 
 

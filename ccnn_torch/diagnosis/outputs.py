@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis.checks.identifiable import Check
 from ccnn_torch.diagnosis.page.data import CORRECTED, NEXT, RESULT, about_of
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
 from ccnn_torch.diagnosis.page.tables import write_next_csv
-from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.diagnosis.result import Diagnosis, Said
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
 from ccnn_torch.diagnosis.verdict.text import noise_text
@@ -29,7 +29,7 @@ from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
 
 
-def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
+def write_result(folder: Path, diagnosis: Said) -> Path:
     """Write `diagnosis.json` alone.
 
     Raises:

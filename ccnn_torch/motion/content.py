@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ccnn_torch.diagnosis.result import effect_block
 from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
 from ccnn_torch.display import number_text
 from ccnn_torch.effects.words import words_of
@@ -81,19 +82,8 @@ def effects_of(
             fit = v.best if e in v.best.members else next((f for f in found.found[i] if f.members == (e,)), None)
             if fit is not None and (e in v.best.members or not any(e in w.best.members for w in verdicts)):
                 parameters |= _parameters(library, i, fit, e, found.found[i][0].noise + found.form[i])
-        rows.append(
-            {
-                "name": name,
-                "probability": 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts),
-                "parameters": parameters,
-                "gap_before": own.before,
-                "gap_after": own.after,
-                "shrink": own.shrink,
-                "shrink_ci95": own.interval,
-                "indistinguishable_from": list(like),
-                "signatures": {},
-            }
-        )
+        probability = 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts)
+        rows.append(effect_block(name, probability, parameters, own, like, {}))
     return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
 
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.progress import at_step
-from ccnn_torch.diagnosis.verdict.text import verdict_text
+from ccnn_torch.diagnosis.result import Said, content_of, gap_block, order_block, verdict_block
 from ccnn_torch.evidence.shrink import draws
 from ccnn_torch.motion.content import effects_of, floor_of, hidden_of, notes_of, where_is
 from ccnn_torch.motion.effects import motion_effects
@@ -29,29 +28,25 @@ from ccnn_torch.motion.setting import problem_of
 
 
 @dataclass(frozen=True)
-class MotionDiagnosis:
-    """Which effect, where, how far.
+class MotionDiagnosis(Said):
+    """Which effect, where, how far, from logs of a motion.
 
     Attributes:
-        content: of `diagnosis.json`.
         problem: the data and the library.
         found: what was fitted.
         verdicts: of each axis.
         before, after: residuals held out, with nothing and with the verdict's effects, `n x b x s` [rad or m].
         proposed: the motions of `next_measurements`.
+        nominal: the model.
     """
 
-    content: dict[str, Any]
     problem: Problem = field(repr=False)
     found: Search = field(repr=False)
     verdicts: Sequence[AxisVerdict] = field(repr=False)
     before: Tensor = field(repr=False)
     after: Tensor = field(repr=False)
     proposed: Sequence[Motion] = field(repr=False)
-
-    def to_json(self) -> Mapping[str, Any]:
-        """The content of `diagnosis.json` (`DiagnosisResults`)."""
-        return self.content
+    nominal: Nominal = field(repr=False)
 
 
 @torch.no_grad()
@@ -100,49 +95,22 @@ def diagnose_motion(
     every = effects_of(problem, found, verdicts, each)
     at_step("next measurements")
     wanted, proposed = next_motions(found, verdicts)
-    verdict: dict[str, Any] = {
-        "effects": names,
-        "probability": math.prod(v.probability for v in verdicts),
-        "shrink": total.shrink,
-        "shrink_ci95": total.interval,
-        "none": not names and not drivers,
-        "outside_library": bool(drivers),
-        "driver": drivers[0] if drivers else None,
-        "drivers": drivers,
-        "text": "",
-    }
-    content: dict[str, Any] = {
-        "motion": True,
-        "mechanism": {
+    content = content_of(
+        motion=True,
+        mechanism={
             "name": nominal.name,
             "joints": [f"q{i + 1}" for i in range(len(data.units))],
             "gravity": [0.0, 0.0, -STANDARD_GRAVITY],
         },
-        "noise": "given" if noise else "estimated",
-        "gap": {
-            "unit": data.units[0],
-            "before": total.before,
-            "after": total.after,
-            "noise_floor": total.floor,
-            "reducible_share": max(0.0, 1 - floor / total.before**2) if total.before else 0.0,
-        },
-        "gap_rotation": None,
+        noise="given" if noise else "estimated",
+        gap=gap_block(total, data.units[0]),
         **where_is(problem, nothing, drawn),
-        "effects": every,
-        "in_order": [
-            {"name": name, "gap_after": gap.after, "shrink": gap.shrink, "shrink_ci95": gap.interval}
-            for name, gap in zip(names, in_steps, strict=True)
-        ],
-        "by_block": None,
-        "network": None,
-        "verdict": verdict,
-        "next_measurements": wanted,
-        "missing_covariates": [],
-        "not_seen": {n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
-        "rows_set_aside": [],
-        "why_set_aside": [],
-        "cautions": hidden_of(problem, verdicts),
-        "notes": notes_of(folded, nominal, found, total.floor, noise),
-    }
-    verdict["text"] = verdict_text(content)
-    return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed)
+        effects=every,
+        in_order=order_block(names, in_steps),
+        verdict=verdict_block(names, math.prod(v.probability for v in verdicts), total, bool(drivers), drivers),
+        next_measurements=wanted,
+        not_seen={n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
+        cautions=hidden_of(problem, verdicts),
+        notes=notes_of(folded, nominal, found, total.floor, noise),
+    )
+    return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed, nominal)

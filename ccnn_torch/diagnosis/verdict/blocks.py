@@ -7,6 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE
+from ccnn_torch.diagnosis.result import effect_block, gap_block
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
@@ -54,19 +55,21 @@ class Blocks:
 def blocks(made: Blocks) -> tuple[dict[str, Any], dict[str, Any] | None, list[dict[str, Any]]]:
     """`gap`, `gap_rotation`, `effects` of diagnosis.json."""
     position, rotation = bool(made.position.any()), bool((~made.position).any())
-    gap = _gap(made.main(made.together), "m" if position else "rad")
-    turned = _gap(made.gap(made.together, False), "rad") if rotation and position else None
-    return gap, turned, [_effect(made, name) for name in _ordered(made)]
-
-
-def in_order(made: Blocks) -> list[dict[str, Any]]:
-    """`in_order` of diagnosis.json: the verdict's effects added one after the other, each step refitted."""
-    found = []
-    for name, held in zip(made.judgement.names, made.steps, strict=True):
-        gap = made.main(held)
-        interval = None if gap.interval is None else list(gap.interval)
-        found.append({"name": name, "gap_after": gap.after, "shrink": gap.shrink, "shrink_ci95": interval})
-    return found
+    gap = gap_block(made.main(made.together), "m" if position else "rad")
+    turned = gap_block(made.gap(made.together, False), "rad") if rotation and position else None
+    judged = made.judgement
+    effects = [
+        effect_block(
+            name,
+            judged.marginal.get(name, 0.0),
+            _parameters(made, name),
+            made.main(made.alone[name]),
+            judged.classes.get(name, ()),
+            made.apart.get(name, {}),
+        )
+        for name in _ordered(made)
+    ]
+    return gap, turned, effects
 
 
 def noise_floor(analysis: Analysis) -> Tensor:
@@ -84,32 +87,6 @@ def noise_floor(analysis: Analysis) -> Tensor:
     # No more than the richest fit leaves.
     share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)
     return (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * share
-
-
-def _gap(gap: Gap, unit: str) -> dict[str, Any]:
-    share = max(0.0, 1 - (gap.floor / gap.before) ** 2) if gap.before > 0 else 0.0
-    return {
-        "unit": unit,
-        "before": gap.before,
-        "after": gap.after,
-        "noise_floor": gap.floor,
-        "reducible_share": share,
-    }
-
-
-def _effect(made: Blocks, name: str) -> dict[str, Any]:
-    alone = made.main(made.alone[name])
-    return {
-        "name": name,
-        "probability": made.judgement.marginal.get(name, 0.0),
-        "parameters": _parameters(made, name),
-        "gap_before": alone.before,
-        "gap_after": alone.after,
-        "shrink": alone.shrink,
-        "shrink_ci95": None if alone.interval is None else list(alone.interval),
-        "indistinguishable_from": list(made.judgement.classes.get(name, ())),
-        "signatures": made.apart.get(name, {}),
-    }
 
 
 def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
