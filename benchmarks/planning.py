@@ -20,8 +20,7 @@ from ccnn_torch.identification import inverse_problem, split_by_leg
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.planning import draw_candidates
 from ccnn_torch.planning.candidates import common_coordinates, identification_rows
-from ccnn_torch.planning.design import Design, _exchange_gain, add_best, make_design
-from ccnn_torch.planning.small_matrices import log_determinant, small_cholesky
+from ccnn_torch.planning.design import Design, _exchange_gain, add_best, log_determinant, make_design, small_cholesky
 
 # Candidates that the plain loop is timed on; all 100,000 would take it half a minute a step.
 PLAIN = 2000

@@ -28,12 +28,14 @@ from ccnn_torch.planning.design import (
     _exchange_gain,
     add_best,
     exchange,
+    forward_substitute,
+    log_determinant,
     make_design,
     order_by_worth,
     removal_loss,
+    small_cholesky,
     tightest_bound,
 )
-from ccnn_torch.planning.small_matrices import forward_substitute, log_determinant, small_cholesky
 
 
 def draw(seed: int, *shape: int) -> Tensor:
