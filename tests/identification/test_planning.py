@@ -16,6 +16,7 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import ParameterChoice, Problem, inverse_problem, solve_lm
 from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.numerics.designs import forward_substitute, log_determinant, small_cholesky
 from ccnn_torch.planning import (
     choose_poses,
     draw_candidates,
@@ -28,12 +29,9 @@ from ccnn_torch.planning.design import (
     _exchange_gain,
     add_best,
     exchange,
-    forward_substitute,
-    log_determinant,
     make_design,
     order_by_worth,
     removal_loss,
-    small_cholesky,
     tightest_bound,
 )
 
