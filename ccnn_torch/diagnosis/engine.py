@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.checks.cautions import cautions, of_inferred
-from ccnn_torch.diagnosis.checks.missing_covariates import missing_covariates
-from ccnn_torch.diagnosis.checks.order_of_rows import directions_of_order, order_shows
-from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows, plausible_rows
+from ccnn_torch.diagnosis.checks.mistakes import PlausibleRows, plausible_rows
+from ccnn_torch.diagnosis.checks.unrecorded import directions_of_order, missing_covariates, order_shows
 from ccnn_torch.diagnosis.discrepancy.interaction import CROSS
 from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes

@@ -15,8 +15,8 @@ from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of, wi
 from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
 from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
 from ccnn_torch.diagnosis.from_records import naming
-from ccnn_torch.diagnosis.outputs import write_diagnosis, write_result
 from ccnn_torch.diagnosis.page.data import RESULT, about_of, load_labels
+from ccnn_torch.diagnosis.page.outputs import write_diagnosis, write_result
 from ccnn_torch.diagnosis.page.report import print_diagnosis
 from ccnn_torch.diagnosis.progress import TO_REPORT, TO_VERDICT, watched
 from ccnn_torch.diagnosis.result import Said

@@ -21,11 +21,10 @@ from ccnn_torch.motion.form import deviations
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.nominal import Nominal
-from ccnn_torch.motion.phases import PHASES, phases_of
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.spec import Fit
-from ccnn_torch.motion.stretches import Stretches
+from ccnn_torch.motion.stretches import PHASES, Stretches, phases_of
 
 _SHAPE_UNITS = {"flexible_damping": "1", "play_loaded": "1", "encoder_at_motor": "1"}
 # Of those that are over the unit of the axis.

@@ -17,9 +17,9 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.motion.effects.bodies import CARRIED
 from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.engine import MotionDiagnosis
-from ccnn_torch.motion.models import nominal_of
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.servo import TORQUES, axis_keys
+from ccnn_torch.motion.setting import nominal_of
 from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.plugins import code_refused
 from ccnn_torch.report.json_files import read_json, write_json
@@ -94,7 +94,7 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
             parameters[name] += float(v.sum() / (v != 0).sum().clamp_min(1))
         content["mechanism_keys"] = parameters
     elif nominal.loaded is not None:
-        from ccnn_torch.motion.mujoco_write import write_mjcf
+        from ccnn_torch.motion.mujoco_motion import write_mjcf
 
         written = [{name: axis.get(name, ABSENT[name]) for name in _IN_MJCF} for axis in axes]
         write_mjcf(nominal.name, folder / _MODEL, written, nominal.gains, _at_tool(found))

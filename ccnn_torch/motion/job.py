@@ -14,8 +14,8 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
 from ccnn_torch.motion.identified import IDENTIFIED, write_identified
 from ccnn_torch.motion.log import load_logs
-from ccnn_torch.motion.models import nominal_of
-from ccnn_torch.motion.phases import phases_of
+from ccnn_torch.motion.setting import nominal_of
+from ccnn_torch.motion.stretches import phases_of
 from ccnn_torch.report.csv_file import write_rows
 
 _STEPS = {

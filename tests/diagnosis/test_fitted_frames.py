@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.diagnosis.from_records import situation_of
-from ccnn_torch.diagnosis.outputs import write_corrected
+from ccnn_torch.diagnosis.page.outputs import write_corrected
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.effects import Acting, make_effect, reached
 from ccnn_torch.errors import InputError

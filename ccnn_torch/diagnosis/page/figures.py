@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis.page.data import About, gaps_of, used_rows
 from ccnn_torch.diagnosis.page.tables import shares
 from ccnn_torch.diagnosis.verdict.text import driver_words, floor_words, probability_words
 from ccnn_torch.display import display_unit, number_text
-from ccnn_torch.motion.phases import PHASES
+from ccnn_torch.motion.stretches import PHASES
 from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, styled
 from ccnn_torch.report.figures.workspace import draw_pairs, height_of, planes_of
 

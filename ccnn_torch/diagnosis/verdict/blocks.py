@@ -1,9 +1,12 @@
-"""The blocks of a diagnosis from an analysis and its judgement."""
+"""The blocks of a diagnosis from an analysis and its judgement; why rows do not distinguish two effects."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE
@@ -11,7 +14,6 @@ from ccnn_torch.diagnosis.result import effect_block, gap_block
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
-from ccnn_torch.diagnosis.verdict.separability import signature_angles
 from ccnn_torch.effects import Coefficient
 from ccnn_torch.evidence.dictionary import covariance
 from ccnn_torch.evidence.shrink import Gap, HeldOut, draws, shrink_of
@@ -152,3 +154,61 @@ def _ordered(made: Blocks) -> list[str]:
     marginal = made.judgement.marginal
     tie = {n: made.alone[n].left.square().sum() for n in made.alone}
     return sorted(made.alone, key=lambda n: (-marginal.get(n, 0.0), float(tie[n]), n))
+
+
+_RANK = 1e-9
+
+
+def signature_angles(analysis: Analysis, judgement: Judgement) -> dict[str, dict[str, dict[str, float]]]:
+    """Of each of the verdict's effects how far its signature is from those that may replace it.
+
+    A signature is the fitted part of an effect in units of the noise, the verdict's other effects projected out. The
+    angle is the principal one between it and all that the other effect can do (Björck and Golub 1973): 0 where the
+    other can do the very same. What no fit of the other can copy is the sine of the angle times the size of the
+    signature, the root of a sum of squares over all rows: below about 3 noise hides it, at any angle.
+
+    Returns:
+        `{effect: {other: {"angle" [rad], "separation" [1, times the noise]}}}`.
+    """
+    atoms = analysis.atoms
+    found = judgement.found
+    flat = analysis.dictionary.columns.flatten(0, 1)
+
+    def columns(members: Sequence[int]) -> Tensor:
+        return torch.cat([flat[:, :0], *(flat[:, analysis.dictionary.groups[i]] for i in members)], -1)
+
+    block: dict[str, dict[str, dict[str, float]]] = {}
+    for i, mean in zip(found.members, found.mean, strict=True):
+        like = judgement.classes.get(atoms[i].name, ())
+        if not like:
+            continue
+        beside = span_of(columns([j for j in found.members if j != i]))
+        own = _without(beside, columns([i]) @ mean[:, None])[:, 0]
+        size = float(torch.linalg.vector_norm(own))
+        block[atoms[i].name] = {}
+        for name in like:
+            # Where a name has several atoms (shapes), the closest one.
+            spans = [span_of(_without(beside, columns([j]))) for j, a in enumerate(atoms) if a.name == name]
+            angle = min(_angle(own, span) for span in spans)
+            block[atoms[i].name][name] = {"angle": angle, "separation": size * math.sin(angle)}
+    return block
+
+
+def span_of(x: Tensor) -> Tensor:
+    """Orthonormal columns of what the columns of x span, `N x r`."""
+    if not x.shape[-1]:
+        return x
+    u, s, _ = torch.linalg.svd(x, full_matrices=False)
+    span: Tensor = u[:, s > _RANK * s.max().clamp_min(1e-300)]
+    return span
+
+
+def _without(span: Tensor, x: Tensor) -> Tensor:
+    return x - span @ (span.mT @ x)
+
+
+def _angle(line: Tensor, span: Tensor) -> float:
+    """Between a vector and a subspace, by its sine: the arc cosine is blind to small angles."""
+    outside = torch.linalg.vector_norm(_without(span, line[:, None]))
+    inside = torch.linalg.vector_norm(span.mT @ line)
+    return float(torch.atan2(outside, inside))
