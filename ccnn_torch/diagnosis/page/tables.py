@@ -193,7 +193,7 @@ def confusable_table(results: Block) -> Table | None:
         "hidden. Separated by: the first of the next measurements that does."
     )
     columns = ("pair", "probability", "angle [°]", "difference / noise [1]", "separated by")
-    return Table("Which effects do these rows not distinguish?", columns, rows, note, ("separated by",))
+    return Table("Which effects do these rows not distinguish?", columns, rows, note, ("separated by",), page_only=True)
 
 
 def unseen_table(results: Block) -> Table | None:
@@ -337,7 +337,7 @@ def region_table(results: Block, about: About) -> Table | None:
             cells.append(f"{low} to {high}")
         rows.append((*cells, percent(region["share"]), percent_interval(interval), str(region["rows"])))
     columns = (*names, *_SHARES, "rows")
-    return Table("In which region?", columns, rows, "Largest share first. " + _share_note(results))
+    return Table("In which region?", columns, rows, "Largest share first. " + _share_note(results), page_only=True)
 
 
 def next_table(results: Block, about: About) -> Table | None:
@@ -434,4 +434,5 @@ def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about
         for row, reason in zip(cells, reasons, strict=True):
             row.append(reason)
     note = f"They are evidence neither for nor against any effect and count in no figure above. {note}"
-    return Table("Which rows were set aside?", tuple(columns), [tuple(cell) for cell in cells], note, ("why",))
+    rows = [tuple(cell) for cell in cells]
+    return Table("Which rows were set aside?", tuple(columns), rows, note, ("why",), page_only=True)

@@ -325,10 +325,10 @@ def _blocks(results: Block) -> list[Block]:
     return [b for b in (results["gap"], results.get("gap_rotation")) if b and b["before"]]
 
 
-def size_text(value: float, block: Block) -> str:
+def size_text(value: float, block: Block, digits: int = 3) -> str:
     """A size in the unit of a block of `diagnosis.json`, in the prefix that fits."""
     scale, unit = display_unit(block["unit"], value)
-    return f"{number_text(value / scale, 3)} {unit}"
+    return f"{number_text(value / scale, digits)} {unit}"
 
 
 def _times(ratio: float) -> str:
