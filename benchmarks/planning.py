@@ -18,10 +18,10 @@ import torch
 from benchmarks.measure import Row, compare
 from ccnn_torch.identification import inverse_problem, split_by_leg
 from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.numerics.designs import log_determinant
 from ccnn_torch.planning import draw_candidates
 from ccnn_torch.planning.candidates import common_coordinates, identification_rows
 from ccnn_torch.planning.design import Design, _exchange_gain, add_best, make_design
-from ccnn_torch.planning.small_matrices import log_determinant, small_cholesky
 
 # Candidates that the plain loop is timed on; all 100,000 would take it half a minute a step.
 PLAIN = 2000
@@ -29,7 +29,7 @@ PLAIN = 2000
 
 def all_gains(design: Design, old: int) -> torch.Tensor:
     """What every candidate in place of `old` adds to the determinant's logarithm."""
-    factor = small_cholesky(design.spread + torch.eye(len(design.spread), dtype=torch.float64)[:, :, None])
+    factor = design.factor
     everyone = torch.arange(design.rows.shape[-1])
     return _exchange_gain(design, old, everyone, factor, log_determinant(factor))
 

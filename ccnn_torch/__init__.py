@@ -27,15 +27,4 @@ if TYPE_CHECKING:
     from ccnn_torch.records import load_records as load_records
     from ccnn_torch.version import __version__ as __version__
 else:
-    __getattr__, __all__ = door(
-        __name__,
-        {
-            "api": "calibrate diagnose_motion identify verify",
-            "compensation": "Compensator export_model load_model save_model",
-            "diagnosis": "diagnose",
-            "mechanisms": "Mechanism load_mechanism",
-            "pseudoerror": "joint_deviations",
-            "records": "load_records",
-            "version": "__version__",
-        },
-    )
+    __getattr__, __all__ = door(__name__)

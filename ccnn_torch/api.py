@@ -55,7 +55,7 @@ def diagnose_motion(**keys: Any) -> MotionDiagnosis:
     Raises:
         InputError: a key, the logs or the model cannot be used; the sentence says what to change.
     """
-    return diagnosed(DiagnoseConfig.from_keys(**keys))[0]
+    return diagnosed(DiagnoseConfig.from_keys(**keys))
 
 
 def identify(**keys: Any) -> Identification:

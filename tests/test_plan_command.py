@@ -32,7 +32,8 @@ def test_a_plan_is_a_file_for_the_machine_and_a_page_for_the_person(cli: Cli, tm
     assert torch.equal(mechanism.solve_inverse(records.pose), records.joints)  # 17 digits: the floats themselves
     page = out.with_suffix(".md").read_text()
     assert "poses.png" in page and "## What each further pose gives" in page and "| gamma2 | " in page
-    assert {f.suffix for f in out.parent.iterdir()} == {".csv", ".md", ".png", ".svg"}
+    assert {f.suffix for f in out.parent.iterdir()} == {".csv", ".html", ".md", ".png", ".svg"}
+    assert "<svg" in (shown := out.with_suffix(".html").read_text()) and "What each further pose gives" in shown
 
 
 def test_each_leg_has_its_rows_and_the_same_seed_gives_the_same_bytes(cli: Cli, tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ FLOORS = [
     ["motion"],
     ["engine", "report", "run_folder", "config", "testing"],
     ["simulation", "planning", "verification/promise", "identification"],
-    ["diagnosis/config", "diagnosis/page", "diagnosis/outputs", "diagnosis/job"],
+    ["diagnosis/config", "diagnosis/page", "diagnosis/job"],
     ["motion/identified", "motion/compensate", "motion/job", "motion/__init__"],
     ["calibration", "sklearn", "study", "verification", "starter"],
     ["api", "cli", "__init__", "__main__"],

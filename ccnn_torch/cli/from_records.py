@@ -242,8 +242,8 @@ def check(
     """
     with loading():
         from ccnn_torch.diagnosis.job import run_check
-        from ccnn_torch.diagnosis.outputs import write_check
-        from ccnn_torch.diagnosis.page.check import check_table, check_text
+        from ccnn_torch.diagnosis.page.outputs import write_check
+        from ccnn_torch.diagnosis.page.report import check_table, check_text
         from ccnn_torch.report.screen import say, stdout, with_status
         from ccnn_torch.report.table import print_table
 

@@ -111,7 +111,9 @@ def compare(
 
 def plan(
     poses: Annotated[int, typer.Option(help="How many poses to plan (per_leg: for each leg).")],
-    out: Annotated[Path, typer.Option(help="CSV to write; a page .md and a picture .png, .svg are written beside it.")],
+    out: Annotated[
+        Path, typer.Option(help="CSV to write; a page .html, .md and a picture .png, .svg are written beside it.")
+    ],
     overrides: Words = None,
     mechanism: Mechanism = None,
     records: Annotated[
@@ -141,9 +143,8 @@ def plan(
     """
     from ccnn_torch.planning.config import PlanConfig
     from ccnn_torch.planning.job import check_plan_file, make_plan, write_plan
-    from ccnn_torch.planning.page import gain_table, left_out_sentence, parameter_table, plan_sentence
-    from ccnn_torch.report.screen import progress_bar, say, say_place, stdout
-    from ccnn_torch.report.table import print_table
+    from ccnn_torch.planning.page import plan_page
+    from ccnn_torch.report.screen import progress_bar, say_place, stdout
 
     file, changes = config_and_changes(overrides or [], config, mechanism=mechanism, seed=seed)
     wanted = PlanConfig.from_file(file, changes, noted(quiet))
@@ -157,12 +158,7 @@ def plan(
         machine, plans = make_plan(wanted.mechanism, poses, wanted, lambda done: bar.update(task, completed=done))
     if not quiet:
         # Before anything is written, so that the result is not lost if the disk is full.
-        for part in plans:
-            print_table(parameter_table(part), stdout)
-            print_table(gain_table(part, short=True), stdout)
-            if sentence := left_out_sentence(part):
-                say(sentence)
-            say(plan_sentence(part, wanted.least_gain))
+        plan_page(machine.name, plans, wanted.least_gain, short=True).show(stdout)
     files = write_plan(out, machine, plans, wanted.least_gain, wanted)
     if not quiet:
         say_place(f"Written: {', '.join(str(file) for file in files)}")

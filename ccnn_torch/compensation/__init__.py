@@ -44,22 +44,4 @@ if TYPE_CHECKING:
     )
     from ccnn_torch.compensation.targets.export import export_model as export_model
 else:
-    __getattr__, __all__ = door(
-        __name__,
-        {
-            "compensator": "Compensator Solution default_limit",
-            "domain": "Domain",
-            "effects.effects": "Care PhysicalEffects effect_deviation expand_effects gains",
-            "fit": "fit_compensator",
-            "geometry.chebyshev": "expand",
-            "machine.inverse": "build_machine",
-            "machine.machine": "Machine Rule",
-            "machine.parts": "geometric_deviation machine_parts",
-            "model_files.identified": "IdentifiedGeometry load_compensation sign_model",
-            "model_files.load": "LoadedModel load_model",
-            "model_files.save": "FORMS card_name save_model",
-            "model_files.signature": "new_key_pair",
-            "networks": "UncertainNetwork network_from_description register_network",
-            "targets.export": "export_model",
-        },
-    )
+    __getattr__, __all__ = door(__name__)

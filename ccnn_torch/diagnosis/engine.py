@@ -10,23 +10,22 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.checks.cautions import cautions, of_inferred
-from ccnn_torch.diagnosis.checks.missing_covariates import missing_covariates
-from ccnn_torch.diagnosis.checks.order_of_rows import directions_of_order, order_shows
-from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows, plausible_rows
-from ccnn_torch.diagnosis.design.next_measurements import next_measurements
+from ccnn_torch.diagnosis.checks.mistakes import PlausibleRows, plausible_rows
+from ccnn_torch.diagnosis.checks.unrecorded import directions_of_order, missing_covariates, order_shows
 from ccnn_torch.diagnosis.discrepancy.interaction import CROSS
 from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes
+from ccnn_torch.diagnosis.next_measurements import next_measurements
 from ccnn_torch.diagnosis.progress import at_step
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, noise_of_repeats
 from ccnn_torch.diagnosis.residual.rows import copies_of, picked
-from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.diagnosis.result import Diagnosis, content_of, order_block, verdict_block
 from ccnn_torch.diagnosis.search.analysis import Analysis, analyse
 from ccnn_torch.diagnosis.shrink.by_block import by_block
-from ccnn_torch.diagnosis.verdict.blocks import Blocks, blocks, in_order
+from ccnn_torch.diagnosis.verdict.blocks import Blocks, blocks
 from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge_rows, without_names
 from ccnn_torch.diagnosis.verdict.localisation import localise
-from ccnn_torch.diagnosis.verdict.text import lacking_text, shared_text, unseen_text, verdict_text
+from ccnn_torch.diagnosis.verdict.text import lacking_text, shared_text, unseen_text
 from ccnn_torch.effects import (
     Effect,
     Situation,
@@ -183,55 +182,45 @@ def _diagnosis(said: _Judged, is_given: bool, seed: int) -> Diagnosis:
     missing = missing_covariates(analysis, said.effects, said.lacking, judgement.drivers, seed)
     doubts = cautions(analysis, judgement, rows, missing, together)
     doubts += [of_inferred(said.inferred)] if said.inferred else []
-    texts = [caution.text for caution in doubts]
     every_driver = dict.fromkeys(d for one in judgement.drivers for d in one.split(CROSS))
     drivers = [d for d in every_driver if not d.startswith(SPEED)]
     # A condition says more than the joint that it acts beside.
     drivers.sort(key=lambda d: d.startswith("joint"))
-    verdict = {
-        "effects": [OUTLIER] if outlier else list(judgement.names),
-        "probability": min([judgement.probability, *(caution.most for caution in doubts)]),
-        "shrink": together.shrink,
-        "shrink_ci95": None if together.interval is None else list(together.interval),
-        "none": nothing and not outlier,
-        "outside_library": judgement.outside,
-        "driver": drivers[0] if drivers else None,
-        "drivers": drivers,
-        "text": "",
-    }
+    names = [OUTLIER] if outlier else judgement.names
+    probability = min([judgement.probability, *(caution.most for caution in doubts)])
     why = why_set_aside(analysis, rows, said.chosen)
     shown = said.known is not None and (is_given or analysis.instrument is not None)
     source = said.known.source if said.known is not None and shown else "estimated"
-    content = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
-    verdict["text"] = verdict_text(content | {"noise": source, "rows_set_aside": sorted(why), "not_seen": unseen})
     places, intervals = localise(analysis, made.residual, seed)
     at_step("by block")
     far = by_block(made)
     at_step("next measurements")
     proposed = next_measurements(analysis, judgement, seed)
-    return Diagnosis(
+    content = content_of(
+        mechanism={
+            "name": analysis.situation.mechanism.name,
+            "joints": [joint.name for joint in analysis.situation.mechanism.joints],
+            "gravity": analysis.situation.gravity.tolist(),
+        },
         noise=source,
         gap=gap,
         gap_rotation=gap_rotation,
         where=places,
         where_ci95=intervals,
         effects=listed,
-        in_order=in_order(made),
+        in_order=order_block(judgement.names, [made.main(held) for held in made.steps]),
         by_block=far,
-        network=None,
-        verdict=verdict,
+        verdict=verdict_block(names, probability, together, judgement.outside, drivers),
         next_measurements=proposed,
         missing_covariates=missing,
         not_seen=unseen,
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
-        cautions=texts,
+        cautions=[caution.text for caution in doubts],
         notes=_notes(said, unseen, missing, proposed),
-        acting=tuple(analysis.acting(judgement.found)),
-        analysis=analysis,
-        judgement=judgement,
-        inferred=said.inferred,
+        machine=None,
     )
+    return Diagnosis(content, tuple(analysis.acting(judgement.found)), analysis, judgement, inferred=said.inferred)
 
 
 def _notes(

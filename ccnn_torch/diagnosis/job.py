@@ -2,35 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+import os
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from ccnn_torch.config.sizes import noise_of_pose
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of, with_network
 from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
 from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
 from ccnn_torch.diagnosis.from_records import naming
-from ccnn_torch.diagnosis.outputs import write_diagnosis, write_result
-from ccnn_torch.diagnosis.page.compensate import compensate_lines, typed_path
 from ccnn_torch.diagnosis.page.data import RESULT, about_of, load_labels
+from ccnn_torch.diagnosis.page.outputs import write_diagnosis, write_result
 from ccnn_torch.diagnosis.page.report import print_diagnosis
 from ccnn_torch.diagnosis.progress import TO_REPORT, TO_VERDICT, watched
+from ccnn_torch.diagnosis.result import Said
 from ccnn_torch.display import short_path
+from ccnn_torch.effects import OUTLIER
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.mechanisms import Mechanism, load_mechanism, simulated_rows
 from ccnn_torch.records import Records, load_records
+from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.screen import say_place, stdout, step_bar
 from ccnn_torch.report.table import print_text
 from ccnn_torch.run_folder.folder import if_stopped, locked
 
+_Found = TypeVar("_Found", bound=Said)
+
+
+class Job(NamedTuple, Generic[_Found]):
+    """What the diagnosis of poses and that of a motion do each in its way; the rest of both is `run_job`.
+
+    Attributes:
+        steps: to the verdict, with about the seconds that each takes.
+        diagnose: from the config to the verdict; it is told the function that shows progress.
+        complete: what takes longer than the verdict: writes the report, and returns the files beside `diagnosis.json`.
+    """
+
+    steps: Mapping[str, float]
+    diagnose: Callable[[DiagnoseConfig, Callable[..., None]], _Found]
+    complete: Callable[[DiagnoseConfig, Path, _Found, bool], Sequence[str]]
+
 
 def run_diagnosis(config: DiagnoseConfig, quiet: bool = False, details: bool = False) -> Path:
+    """Diagnose poses; as `run_job`."""
+    return run_job(Job(TO_VERDICT, _verdict, _complete), config, quiet, details)
+
+
+def run_job(job: Job[_Found], config: DiagnoseConfig, quiet: bool, details: bool) -> Path:
     """Diagnose, and write the folder of the config; the verdict is shown and kept before all that takes longer.
 
     Args:
+        job: of poses or of a motion.
         config: of the diagnosis.
         quiet: no verdict, no table, no progress.
         details: show all tables.
@@ -41,16 +68,22 @@ def run_diagnosis(config: DiagnoseConfig, quiet: bool = False, details: bool = F
     """
     folder = folder_of(config)
     stopped = if_stopped("interrupted before there was a verdict; nothing was written")
-    with stopped, step_bar(TO_VERDICT, quiet) as tell, watched(tell):
-        found = _verdict(config, tell)
+    with stopped, step_bar(job.steps, quiet) as tell, watched(tell):
+        said = job.diagnose(config, tell)
     try:
         with locked(folder):
             sweep(folder)
-            kept = write_result(folder, found)
+            kept = write_result(folder, said)
             with if_stopped(f"interrupted after the verdict, which is kept in {kept}; the rest is not complete"):
-                _complete(config, folder, found, quiet, details)
+                if not quiet:
+                    print_text(said.verdict["text"], stdout, "bold")
+                beside = job.complete(config, folder, said, quiet)
+                if not quiet:
+                    results = read_json(kept)
+                    print_diagnosis(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
+                    say_place(f"Written: {typed_path(str(kept))}, and beside it {', '.join(beside)}")
     except InputError:
-        print_diagnosis(found.to_json(), stdout)
+        print_diagnosis(said.to_json(), stdout)
         raise
     return folder
 
@@ -75,24 +108,30 @@ def _verdict(config: DiagnoseConfig, tell: Callable[..., None]) -> Diagnosis:
     return said
 
 
-def _complete(config: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool, details: bool) -> None:
-    """The network on the remainder, the report, the tables."""
-    if not quiet:
-        print_text(found.verdict["text"], stdout, "bold")
+def _complete(config: DiagnoseConfig, folder: Path, said: Diagnosis, quiet: bool) -> list[str]:
+    """The network on the remainder, and the report."""
     steps = TO_REPORT if config.network else {"figures and report": TO_REPORT["figures and report"]}
     with step_bar(steps, quiet) as tell:
         if config.network:
-            found = with_network(found, config.seed, lambda share: tell("network on the remainder", share))
+            said = with_network(said, config.seed, lambda share: tell("network on the remainder", share))
         tell("figures and report")
-        files = config.records if isinstance(config.records, list) else [config.records]
-        rows = ", ".join(short_path(str(file)) for file in files)
-        about: dict[str, Any] = {"name": folder.name, "mechanism": short_path(str(config.mechanism)), "records": rows}
-        lines = compensate_lines(config, found, folder / RESULT)
-        about |= {"folder": typed_path(str(folder)), "compensate": lines}
-        path = write_diagnosis(folder, found, about, config.seed)
-    if not quiet:
-        print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False, details=details)
-        say_place(f"Written: {typed_path(str(path))} and report.html beside it")
+        about = head_of(config, folder, config.records, compensate_lines(config, said, folder / RESULT))
+        write_diagnosis(folder, said, about, config.seed)
+    return ["report.html"]
+
+
+def head_of(
+    config: DiagnoseConfig, folder: Path, files: str | list[str] | None, compensate: Sequence[str]
+) -> dict[str, Any]:
+    """What `About` holds of any job; files: that were diagnosed."""
+    listed = files if isinstance(files, list) else [files]
+    return {
+        "name": folder.name,
+        "mechanism": short_path(str(config.mechanism)),
+        "records": ", ".join(short_path(str(file)) for file in listed),
+        "folder": typed_path(str(folder)),
+        "compensate": compensate,
+    }
 
 
 def _noise(config: DiagnoseConfig, records: Records) -> dict[str, float] | None:
@@ -110,3 +149,52 @@ def _loaded(config: DiagnoseConfig) -> tuple[Records, Mechanism, Sequence[str] |
         config.records, mechanism, config.covariates, learns=False, columns=config.columns, joint_map=config.joint_map
     )
     return records, mechanism, config.effects
+
+
+def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -> tuple[str, ...]:
+    """A sentence, and the command lines to copy; () where there is nothing to compensate.
+
+    Args:
+        config: of the diagnosis.
+        diagnosis: what was found.
+        path: the diagnosis.json that was written.
+    """
+    verdict, covariates = diagnosis.verdict, config.covariates
+    if verdict["none"] or verdict["effects"] == [OUTLIER]:
+        return ()
+    keys = {"records": _records(config), "mechanism": typed_path(str(config.mechanism))}
+    for key, value in (
+        ("columns", config.columns),
+        ("joint_map", config.joint_map),
+        ("mechanism_keys", config.mechanism_keys),
+    ):
+        if value:
+            keys[key] = json.dumps(value, ensure_ascii=False)
+    given = diagnosis.analysis.situation.covariates
+    if covariates is None and "time" in given and diagnosis.machine is not None:
+        # A model that asks for the time holds for that day.
+        covariates = [n for n in given if n != "time" and n not in diagnosis.inferred]
+    if covariates is not None:
+        keys["covariates"] = f"[{','.join(covariates)}]"
+    keys["out"] = f"{typed_path(str(path.parent))}_compensator"
+    run = " ".join(["ccnn run", *(shlex.quote(f"{key}={value}") for key, value in keys.items())])
+    if diagnosis.machine is None:
+        model = shlex.quote(f"{keys['out']}/model.onnx")
+        sentence = "No model holds these effects by themselves: these lines learn the gap and correct targets."
+        return sentence, run, f"ccnn compensate {model} TARGETS.csv COMMANDS.csv"
+    sentence = (
+        "The first line corrects targets by the machine with these effects alone, the second one fits all effects that "
+        "pay, and learns what they leave where that pays."
+    )
+    return sentence, f"ccnn compensate {shlex.quote(typed_path(str(path)))} TARGETS.csv COMMANDS.csv", run
+
+
+def _records(config: DiagnoseConfig) -> str:
+    files = config.records if isinstance(config.records, list) else [str(config.records)]
+    return ",".join(typed_path(file) for file in files)
+
+
+def typed_path(path: str) -> str:
+    """A path as it may be typed here: relative where it is below the current folder."""
+    near = os.path.relpath(path)
+    return path if near.startswith("..") else near

@@ -1,81 +1,121 @@
-"""The result of a diagnosis."""
+"""The result of a diagnosis, of poses or of a motion, and the parts of `diagnosis.json` that both fill alike."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
+from ccnn_torch.diagnosis.verdict.text import verdict_text
 from ccnn_torch.effects import Acting
+from ccnn_torch.evidence.shrink import Gap
 
-_NOT_WRITTEN = ("acting", "analysis", "judgement", "lines", "inferred")
+# Of a result what has no meaning there, or was not asked for.
+_NOTHING: dict[str, Any] = {
+    **dict.fromkeys(("gap_rotation", "by_block", "network")),
+    **{name: [] for name in ("missing_covariates", "rows_set_aside", "why_set_aside")},
+}
 
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """Which effect, where, how far.
+class Said:
+    """What a diagnosis says.
 
     Attributes:
-        noise: where its size is from: `given`, `columns` of the records, `repeats` of targets, or `estimated` from what
-            the best explanation leaves, which may hold another cause.
-        gap, gap_rotation: `{"unit", "before", "after", "noise_floor", "reducible_share"}`, held-out RMS; the rotation's
-            is None without orientation.
-        where: shares of the gap by `outputs`, `joints`, `legs`, `regions`, `covariates`.
-        where_ci95: the same with `[low, high]` in the place of each share, regions and regimes as lists of them.
-        effects: every candidate, most probable first; `signatures` says why one cannot be distinguished from another.
-        in_order: the verdict's effects added one after the other, the largest first.
-        by_block: gap and shrink where rows are held out in blocks, along the direction in which the joints vary most;
-            None where the verdict names nothing.
-        network: what a network on the remainder would still gain; None where it was not asked for.
-        verdict: the conclusion and its certainty.
-        next_measurements: rows that would distinguish the leading explanations.
-        missing_covariates: columns that would bring more effects into sight, most promising first.
-        not_seen: effects that these records cannot show, with what is missing for each.
-        rows_set_aside: rows (0-based) that no fit saw: outliers, near-singular ones, rows outside the reach.
-        why_set_aside: the reason for each of them.
-        cautions: signs that records and model do not fit each other, one sentence each; beside one nothing is claimed
-            more surely than 0.9.
-        notes: what was left out and why, one sentence each.
+        content: of `diagnosis.json`; its entries, which `DiagnosisResults` documents, are attributes as well.
+    """
+
+    content: dict[str, Any]
+
+    def __getattr__(self, name: str) -> Any:
+        content = vars(self).get("content", {})
+        if name not in content:
+            raise AttributeError(f"a diagnosis has no '{name}'; it has {', '.join(content)}")
+        return content[name]
+
+    def with_entries(self, **entries: Any) -> Self:
+        """The same with other entries of `diagnosis.json`."""
+        return replace(self, content=self.content | entries)
+
+    def to_json(self) -> Mapping[str, Any]:
+        """The content of `diagnosis.json` (`DiagnosisResults`)."""
+        return self.content
+
+
+@dataclass(frozen=True)
+class Diagnosis(Said):
+    """Which effect, where, how far, from poses.
+
+    Attributes:
         acting: the verdict's effects with their numbers, to be simulated or compensated.
-        machine: with these, as a compensator takes it; None where a model can hold nothing of them.
         analysis, judgement: everything that was evaluated.
         lines: line of every row in the file that it came from, the header being line 1; () for rows of no file.
         inferred: covariates that were not recorded and were taken from the order of the rows.
     """
 
-    noise: str
-    gap: dict[str, Any]
-    gap_rotation: dict[str, Any] | None
-    where: dict[str, Any]
-    where_ci95: dict[str, Any]
-    effects: list[dict[str, Any]]
-    in_order: list[dict[str, Any]]
-    by_block: dict[str, Any] | None
-    network: dict[str, Any] | None
-    verdict: dict[str, Any]
-    next_measurements: list[dict[str, Any]]
-    missing_covariates: list[dict[str, Any]]
-    not_seen: dict[str, str]
-    rows_set_aside: list[int]
-    why_set_aside: list[str]
-    cautions: list[str]
-    notes: list[str]
     acting: tuple[Acting, ...] = field(repr=False)
     analysis: Analysis = field(repr=False)
     judgement: Judgement = field(repr=False)
     lines: tuple[int, ...] = field(default=(), repr=False)
     inferred: tuple[str, ...] = field(default=(), repr=False)
-    machine: dict[str, Any] | None = field(default=None, repr=False)
 
-    def to_json(self) -> Mapping[str, Any]:
-        """The content of `diagnosis.json` (`DiagnosisResults`)."""
-        situation = self.analysis.situation
-        machine = {
-            "name": situation.mechanism.name,
-            "joints": [joint.name for joint in situation.mechanism.joints],
-            "gravity": situation.gravity.tolist(),
-        }
-        content = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NOT_WRITTEN}
-        return {"mechanism": machine} | content
+
+def content_of(**entries: Any) -> dict[str, Any]:
+    """The content of `diagnosis.json`, the text of its verdict as well; entries: all that are something."""
+    content = _NOTHING | entries
+    content["verdict"]["text"] = verdict_text(content)
+    return content
+
+
+def gap_block(gap: Gap, unit: str) -> dict[str, Any]:
+    """`gap` of diagnosis.json."""
+    share = max(0.0, 1 - (gap.floor / gap.before) ** 2) if gap.before > 0 else 0.0
+    sizes = {"before": gap.before, "after": gap.after, "noise_floor": gap.floor}
+    return {"unit": unit, **sizes, "reducible_share": share}
+
+
+def verdict_block(
+    names: Sequence[str], probability: float, together: Gap, outside: bool, drivers: Sequence[str]
+) -> dict[str, Any]:
+    """`verdict` of diagnosis.json, still without its text; together: the gap with all the names in the model."""
+    return {
+        "effects": [*names],
+        "probability": probability,
+        **_shrink(together),
+        "none": not names and not outside,
+        "outside_library": outside,
+        "driver": drivers[0] if drivers else None,
+        "drivers": [*drivers],
+    }
+
+
+def effect_block(
+    name: str,
+    probability: float,
+    parameters: Mapping[str, Any],
+    alone: Gap,
+    like: Iterable[str],
+    signatures: Mapping[str, Any],
+) -> dict[str, Any]:
+    """An entry of `effects` of diagnosis.json; alone: the gap with it alone in the model."""
+    return {
+        "name": name,
+        "probability": probability,
+        "parameters": parameters,
+        "gap_before": alone.before,
+        "gap_after": alone.after,
+        **_shrink(alone),
+        "indistinguishable_from": [*like],
+        "signatures": signatures,
+    }
+
+
+def order_block(names: Sequence[str], gaps: Sequence[Gap]) -> list[dict[str, Any]]:
+    """`in_order` of diagnosis.json: the verdict's effects added one after the other, each step refitted."""
+    return [{"name": n, "gap_after": gap.after, **_shrink(gap)} for n, gap in zip(names, gaps, strict=True)]
+
+
+def _shrink(gap: Gap) -> dict[str, Any]:
+    return {"shrink": gap.shrink, "shrink_ci95": None if gap.interval is None else [*gap.interval]}

@@ -32,13 +32,4 @@ if TYPE_CHECKING:
         default_gravity as default_gravity,
     )
 else:
-    __getattr__, __all__ = door(
-        __name__,
-        {
-            "apply": "Acting labelled measured_pose moved_joints pose_residual reached signature "
-            "used_covariates without_pose_effects",
-            "protocol": "Coefficient Effect Kind Shape",
-            "registry": "EFFECTS EXACT OUTLIER effect_names make_effect owned check_names missing_on",
-            "situation": "PLATFORM_WEIGHT Situation default_gravity",
-        },
-    )
+    __getattr__, __all__ = door(__name__)

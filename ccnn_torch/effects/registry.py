@@ -258,11 +258,7 @@ def _breaches(effect: OwnEffect, situation: Situation) -> Iterator[str]:
         none = "has no coefficient that is not secondary" if found else "returned no coefficient"
         yield f"coefficients() {none}; where there is nothing to fit, missing() must say why"
     names = [c.name for c in found] + [s.name for s in shapes]
-    for name in names:
-        if not isinstance(name, str) or not name.strip():
-            yield f"one of its coefficients or shapes is called {name!r}, expected a name"
-        if names.count(name) > 1:
-            yield f"two of its coefficients or shapes are called '{name}'; give each its own name"
+    yield from name_breaches(names, "coefficients or shapes")
     for one in found:
         yield from (f"coefficients(): {breach}" for breach in _coefficient_breaches(one, situation))
     for shape in shapes:
@@ -280,7 +276,7 @@ def _breaches(effect: OwnEffect, situation: Situation) -> Iterator[str]:
 def _coefficient_breaches(one: Coefficient, situation: Situation) -> Iterator[str]:
     name, joints = f"coefficient '{one.name}'", [j.name for j in situation.mechanism.joints]
     legs = sorted({g.leg for g in situation.mechanism.geometry if g.leg is not None})
-    if not (_is_number(one.scale) and one.scale > 0):
+    if not (is_number(one.scale) and one.scale > 0):
         yield f"{name} has the scale {one.scale!r}, expected more than 0: its plausible size in {one.unit}"
     if one.joint is not None and one.joint not in joints:
         yield f"{name} is of joint {one.joint!r}, expected one of {', '.join(joints)}, or None"
@@ -292,12 +288,12 @@ def _coefficient_breaches(one: Coefficient, situation: Situation) -> Iterator[st
 
 def _shape_breaches(shape: Shape, coefficients: int) -> Iterator[str]:
     name, grid = f"shape '{shape.name}'", shape.grid
-    if not isinstance(grid, tuple | list) or not grid or not all(map(_is_number, grid)):
+    if not isinstance(grid, tuple | list) or not grid or not all(map(is_number, grid)):
         got = "is empty" if isinstance(grid, tuple | list) and not grid else f"is {grid!r}"
         yield f"the grid of {name} {got}, expected finite numbers to look at, e.g. (0.5, 1.0, 2.0)"
     if not all(a < b for a, b in pairwise(grid)):
         yield f"the grid of {name} does not ascend"
-    if shape.usual is not None and not _is_number(shape.usual):
+    if shape.usual is not None and not is_number(shape.usual):
         yield f"{name} has the usual value {shape.usual!r}, expected a number or None"
     if shape.columns is not None:
         wrong = [k for k in shape.columns if k not in range(coefficients)]
@@ -320,7 +316,17 @@ def _unit_breaches(name: str, unit: object) -> Iterator[str]:
         yield f"the unit '{unit}' of '{name}' is no SI unit"
 
 
-def _is_number(value: object) -> bool:
+def name_breaches(names: Sequence[object], what: str) -> Iterator[str]:
+    """What names of coefficients, shapes or numbers break: each has one, and one of its own."""
+    for name in names:
+        if not isinstance(name, str) or not name.strip():
+            yield f"one of its {what} is called {name!r}, expected a name"
+        if names.count(name) > 1:
+            yield f"two of its {what} are called '{name}'; give each its own name"
+
+
+def is_number(value: object) -> bool:
+    """Whether it is a real, finite number."""
     return isinstance(value, Real) and math.isfinite(value)
 
 

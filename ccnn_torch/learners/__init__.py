@@ -7,10 +7,4 @@ if TYPE_CHECKING:
     from ccnn_torch.learners.protocol import Learner as Learner, TrainingData as TrainingData
     from ccnn_torch.learners.registry import LEARNERS as LEARNERS, make_learner as make_learner
 else:
-    __getattr__, __all__ = door(
-        __name__,
-        {
-            "protocol": "Learner TrainingData",
-            "registry": "LEARNERS make_learner",
-        },
-    )
+    __getattr__, __all__ = door(__name__)

@@ -34,25 +34,4 @@ if TYPE_CHECKING:
         simulated_rows as simulated_rows,
     )
 else:
-    __getattr__, __all__ = door(
-        __name__,
-        {
-            "files.dh_file": "read_dh_file read_urdf",
-            "frames.fit": "fit_frames",
-            "frames.framed": "Framed",
-            "frames.judge": "judge_frames",
-            "frames.partial": "Partial as_measured",
-            "machines.delta": "Delta DeltaLinear",
-            "machines.five_bar": "FiveBar",
-            "machines.overconstrained": "Overconstrained2Dof",
-            "machines.serial": "SerialArm",
-            "machines.stewart": "Stewart",
-            "machines.sliders": "MachineTool Tripod",
-            "mechanism": "InverseKinematics Mechanism",
-            "pose": "PoseError",
-            "registry": "load_mechanism mechanism_from_description mechanism_of_file",
-            "simulators.black_box": "BlackBox",
-            "simulators.mujoco_model": "ModelParameter mujoco_simulator",
-            "simulators.simulator": "Joint Simulator rowwise simulated_rows",
-        },
-    )
+    __getattr__, __all__ = door(__name__)

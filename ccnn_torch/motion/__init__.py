@@ -12,17 +12,7 @@ if TYPE_CHECKING:
         write_identified as write_identified,
     )
     from ccnn_torch.motion.log import Log as Log, load_logs as load_logs
-    from ccnn_torch.motion.models import nominal_of as nominal_of
     from ccnn_torch.motion.nominal import Nominal as Nominal
+    from ccnn_torch.motion.setting import nominal_of as nominal_of
 else:
-    __getattr__, __all__ = door(
-        __name__,
-        {
-            "engine": "MotionDiagnosis diagnose_motion",
-            "feed_forward": "Corrected corrected_command",
-            "identified": "Identified load_identified write_identified",
-            "log": "Log load_logs",
-            "models": "nominal_of",
-            "nominal": "Nominal",
-        },
-    )
+    __getattr__, __all__ = door(__name__)

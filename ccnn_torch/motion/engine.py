@@ -7,18 +7,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.diagnosis.progress import at_step
-from ccnn_torch.diagnosis.verdict.text import verdict_text
-from ccnn_torch.evidence.shrink import draws
-from ccnn_torch.motion.content import effects_of, floor_of, hidden_of, notes_of, where_is
-from ccnn_torch.motion.effects import motion_effects
-from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
+from ccnn_torch.diagnosis.result import Said, content_of, effect_block, gap_block, order_block, verdict_block
+from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
+from ccnn_torch.display import number_text
+from ccnn_torch.effects.words import words_of
+from ccnn_torch.evidence.shrink import INTERVAL, Draws, Gap, draws
+from ccnn_torch.motion.effects import Facts, Number, motion_effects
+from ccnn_torch.motion.effects.bodies import STANDARD_GRAVITY
 from ccnn_torch.motion.fit import ALONE
+from ccnn_torch.motion.form import deviations
 from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes
+from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.linearised import searched
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.next_motion import Motion, next_motions
@@ -26,32 +32,30 @@ from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.setting import problem_of
+from ccnn_torch.motion.spec import Fit
+from ccnn_torch.motion.stretches import PHASES, Stretches, phases_of
 
 
 @dataclass(frozen=True)
-class MotionDiagnosis:
-    """Which effect, where, how far.
+class MotionDiagnosis(Said):
+    """Which effect, where, how far, from logs of a motion.
 
     Attributes:
-        content: of `diagnosis.json`.
         problem: the data and the library.
         found: what was fitted.
         verdicts: of each axis.
         before, after: residuals held out, with nothing and with the verdict's effects, `n x b x s` [rad or m].
         proposed: the motions of `next_measurements`.
+        nominal: the model.
     """
 
-    content: dict[str, Any]
     problem: Problem = field(repr=False)
     found: Search = field(repr=False)
     verdicts: Sequence[AxisVerdict] = field(repr=False)
     before: Tensor = field(repr=False)
     after: Tensor = field(repr=False)
     proposed: Sequence[Motion] = field(repr=False)
-
-    def to_json(self) -> Mapping[str, Any]:
-        """The content of `diagnosis.json` (`DiagnosisResults`)."""
-        return self.content
+    nominal: Nominal = field(repr=False)
 
 
 @torch.no_grad()
@@ -91,58 +95,199 @@ def diagnose_motion(
     residuals = held_out(folded, found.whitening, [*steps, *alone.values()])
     # Of the model itself, also where it was linearised elsewhere.
     residuals[0] = nothing
-    floor = noise**2 * len(verdicts) if noise else floor_of(problem, found, verdicts)
+    floor = noise**2 * len(verdicts) if noise else _floor_of(problem, found, verdicts)
     drawn = draws(len(data.run), seed)
     gaps = [gap_of(problem, nothing, left, floor, noise is not None, drawn) for left in residuals]
     total, in_steps = gaps[len(names)], gaps[1 : len(names) + 1]
     drivers = list(dict.fromkeys(v.driver for v in verdicts if v.driver))
     each = dict(zip(alone, gaps[len(steps) :], strict=True))
-    every = effects_of(problem, found, verdicts, each)
+    every = _effects_of(problem, found, verdicts, each)
     at_step("next measurements")
     wanted, proposed = next_motions(found, verdicts)
-    verdict: dict[str, Any] = {
-        "effects": names,
-        "probability": math.prod(v.probability for v in verdicts),
-        "shrink": total.shrink,
-        "shrink_ci95": total.interval,
-        "none": not names and not drivers,
-        "outside_library": bool(drivers),
-        "driver": drivers[0] if drivers else None,
-        "drivers": drivers,
-        "text": "",
-    }
-    content: dict[str, Any] = {
-        "motion": True,
-        "mechanism": {
+    content = content_of(
+        motion=True,
+        mechanism={
             "name": nominal.name,
             "joints": [f"q{i + 1}" for i in range(len(data.units))],
             "gravity": [0.0, 0.0, -STANDARD_GRAVITY],
         },
-        "noise": "given" if noise else "estimated",
-        "gap": {
-            "unit": data.units[0],
-            "before": total.before,
-            "after": total.after,
-            "noise_floor": total.floor,
-            "reducible_share": max(0.0, 1 - floor / total.before**2) if total.before else 0.0,
-        },
-        "gap_rotation": None,
-        **where_is(problem, nothing, drawn),
-        "effects": every,
-        "in_order": [
-            {"name": name, "gap_after": gap.after, "shrink": gap.shrink, "shrink_ci95": gap.interval}
-            for name, gap in zip(names, in_steps, strict=True)
-        ],
-        "by_block": None,
-        "network": None,
-        "verdict": verdict,
-        "next_measurements": wanted,
-        "missing_covariates": [],
-        "not_seen": {n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
-        "rows_set_aside": [],
-        "why_set_aside": [],
-        "cautions": hidden_of(problem, verdicts),
-        "notes": notes_of(folded, nominal, found, total.floor, noise),
+        noise="given" if noise else "estimated",
+        gap=gap_block(total, data.units[0]),
+        **_where_is(problem, nothing, drawn),
+        effects=every,
+        in_order=order_block(names, in_steps),
+        verdict=verdict_block(names, math.prod(v.probability for v in verdicts), total, bool(drivers), drivers),
+        next_measurements=wanted,
+        not_seen={n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
+        cautions=_hidden_of(problem, verdicts),
+        notes=_notes_of(folded, nominal, found, total.floor, noise),
+    )
+    return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed, nominal)
+
+
+_SHAPE_UNITS = {"flexible_damping": "1", "play_loaded": "1", "encoder_at_motor": "1"}
+# Of those that are over the unit of the axis.
+_OVER = {"play_friction": "s^2"}
+# A limit that is so far away is none.
+_TINY = 1e-9
+
+
+def _floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -> float:
+    """Mean square of what the best sets leave, or the richest fit where it leaves less, summed over the axes."""
+    judged = problem.data.judged
+    left = problem.residual(torch.stack([v.best.spec.theta for v in verdicts]), problem.axes)
+    each = torch.stack([left[:, judged].square().mean(-1), found.rich[:, judged].square().mean(-1)])
+    return float(each.amin(0).sum())
+
+
+def _where_is(problem: Problem, before: Tensor, draws: Draws) -> dict[str, Any]:
+    """`where` and `where_ci95`, shares of the gap by joint and by phase of the motion; and the encoder's step."""
+    data = problem.data
+    squares, phase = before.square() * data.judged, phases_of(data)
+    joints = {f"q{i + 1}": own.sum(-1) for i, own in enumerate(squares)}
+    phases = {name: (squares * (phase == k)).sum((0, -1)) for k, name in enumerate(PHASES)}
+    whole, q = squares.sum((0, -1)), torch.tensor(INTERVAL, dtype=torch.float64)
+    drawn = (draws.counts @ whole).clamp_min(1e-300)
+
+    def shares(parts: Mapping[str, Tensor]) -> dict[str, float]:
+        return {name: float(v.sum() / whole.sum().clamp_min(1e-300)) for name, v in parts.items()}
+
+    def ends(parts: Mapping[str, Tensor]) -> dict[str, list[float]]:
+        return {n: torch.quantile(draws.counts @ v / drawn, q).clamp(0, 1).tolist() for n, v in parts.items()}
+
+    samples = torch.stack([((phase == k) & data.judged).double().sum() for k in range(len(PHASES))])
+    time = dict(zip(PHASES, (samples / samples.sum().clamp_min(1)).tolist(), strict=True))
+    empty: dict[str, Any] = {"outputs": {}, "legs": {}, "regions": [], "covariates": {}}
+    by_phase = {n: {"share": s, "samples": time[n]} for n, s in shares(phases).items()}
+    return {
+        "where": empty | {"joints": shares(joints), "phases": by_phase},
+        "where_ci95": empty | {"joints": ends(joints), "phases": ends(phases)},
+        "encoder_step": _resolution(data) or None,
     }
-    verdict["text"] = verdict_text(content)
-    return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed)
+
+
+def _effects_of(
+    problem: Problem, found: Search, verdicts: Sequence[AxisVerdict], alone: Mapping[str, Gap]
+) -> list[dict[str, Any]]:
+    """`effects`; alone: the gap with each effect alone in the model."""
+    library = problem.library
+    rows = []
+    for name, own in alone.items():
+        e = library.names.index(name)
+        like = dict.fromkeys(library.names[o] for v in verdicts for o in v.classes.get(e, ()))
+        parameters: dict[str, Any] = {}
+        for i, v in enumerate(verdicts):
+            fit = v.best if e in v.best.members else next((f for f in found.found[i] if f.members == (e,)), None)
+            if fit is not None and (e in v.best.members or not any(e in w.best.members for w in verdicts)):
+                parameters |= _parameters(library, i, fit, e, found.found[i][0].noise + found.form[i])
+        probability = 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts)
+        rows.append(effect_block(name, probability, parameters, own, like, {}))
+    return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
+
+
+def _hidden_of(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
+    """Cautions where nothing is named although a set leaves clearly less, a sentence each without a full stop."""
+    names = problem.library.names
+    return [
+        f"q{i + 1} errs by more than the noise, most like {words_of(names[v.hidden]).cause}, but by less than the form "
+        "of a model and time stamps are known to: record motions that show it more"
+        for i, v in enumerate(verdicts)
+        if v.hidden is not None
+    ]
+
+
+def _notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None) -> list[str]:
+    data = problem.data
+    notes = [*data.notes, *nominal.notes]
+    held = [f"q{i + 1}" for i, asked in enumerate(data.command[:, data.judged]) if bool((asked == asked[0]).all())]
+    notes += [f"no log moves {listed(held)}: of such joints little can be told"] if held else []
+    library = problem.library
+    notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
+    runs, folds = len(set(data.run.tolist())), int(problem.fold.max()) + 1
+    if problem.parted and runs > 1:
+        notes.append(f"what is named acts in one run alone: {folds} parts of the runs were held out in turn")
+    elif runs > 1:
+        notes.append(f"held out were whole runs, {runs} of them in {folds} folds")
+    else:
+        notes.append(f"there is one run: its {folds} parts were held out in turn; record a second motion to be surer")
+    step = _resolution(data)
+    if noise is None and step and not step < floor <= 3 * step:
+        what = "most of it is no noise of the encoder" if floor > step else "rounding alone leaves 0.29 times the step"
+        notes.append(
+            f"what the best model leaves is {number_text(floor / step, 2)} times the encoder's step of "
+            f"{number_text(step, 2)} {data.units[0]}{' (all joints together)' if len(data.units) > 1 else ''}: {what}"
+        )
+    order = found.whitening.coefficients.shape[1]
+    notes.append(
+        f"residuals of a closed loop are correlated: they were whitened by an autoregressive model of order {order}, "
+        f"on means over {problem.pool * float(data.time.diff(dim=-1).median()) * 1e3:.0f} ms"
+    )
+    return notes
+
+
+def _resolution(data: Stretches) -> float:
+    """Steps of the encoders that move, root of their summed squares, as the floor is of all joints; 0 where one has
+    none."""
+    moving = [position[data.judged].numpy() for position in data.position]
+    steps = [_step_of(position) for position in moving if np.ptp(position) > 0]
+    return math.hypot(*steps) if all(steps) else 0.0
+
+
+def _step_of(position: NDArray[np.float64]) -> float:
+    """The smallest change of a joint, where nearly all are multiples of it; else 0."""
+    steps = np.diff(np.unique(position))
+    steps = steps[steps > 1e-9]
+    if not len(steps):
+        return 0.0
+    least = float(steps.min())
+    whole = np.abs(steps / least - np.round(steps / least)) < 0.1
+    return least if whole.mean() > 0.9 else 0.0
+
+
+def _unit(unit: str, axis: Facts) -> tuple[str, float]:
+    """The unit of a number in words of the axis, and the factor to it: torques by the gain, where it is known."""
+    gain = axis.gain or 1.0
+    force = "N*m" if axis.unit == "rad" else "N"
+    known = {
+        "joint": (axis.unit, 1.0),
+        "speed": (f"{axis.unit}/s", 1.0),
+        "torque": (force if axis.gain else axis.unit, gain),
+        "inertia": ("kg*m^2" if axis.unit == "rad" else "kg", gain) if axis.gain else ("s^2", 1.0),
+        "viscous": (f"{force}*s/{axis.unit}", gain) if axis.gain else ("s", 1.0),
+    }
+    return known.get(unit, (unit, 1.0))
+
+
+def _parameters(library: Library, axis: int, fit: Fit, effect: int, variance: float) -> dict[str, dict[str, Any]]:
+    """The numbers of one effect of a fit, as `parameters` of diagnosis.json; value: the difference to the model.
+
+    variance: of noise and form errors.
+    """
+    facts = library.facts[axis]
+    found: dict[str, dict[str, Any]] = {}
+    flat = fit.spec.flat
+    deviation = deviations(fit, variance)
+    for j in (j for j in library.places[effect] if j in flat):
+        number: Number = library.numbers[axis][j]
+        unit, factor = _unit(number.unit, facts)
+        value = float(fit.spec.theta[j]) * number.scale
+        sd = float(deviation[flat.index(j)]) * number.scale
+        if number.inverse:
+            value += facts.nominal.get(number.acts[0][0], 0.0)
+            value, sd = 1 / max(value, _TINY), sd / max(value, _TINY) ** 2
+        if all(act.how == "factor" for act in number.acts):
+            sd, value = sd * math.exp(value), math.expm1(value)
+        found[f"q{axis + 1} {number.name}"] = {
+            "value": value * factor,
+            "sd": sd * factor,
+            "unit": unit,
+            "part": f"joint {axis + 1}",
+        } | ({} if number.model is None else {"nominal": number.model})
+    own = {place for variant in library.variants[effect] for place in variant.held}
+    for name, place in library.held.items():
+        value = float(fit.spec.theta[place])
+        if place in own and value:
+            order = "1" if facts.unit == "rad" else "rad/m"
+            unit = order if name == "cogging_order" else _SHAPE_UNITS.get(name, f"{facts.unit}/{_OVER.get(name, 's')}")
+            found[f"q{axis + 1} {name}"] = {"value": value, "sd": None, "unit": unit, "part": f"joint {axis + 1}"}
+    return found

@@ -14,15 +14,16 @@ from typing import Any, NamedTuple
 import torch
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.effects.own_parameter import OWN
-from ccnn_torch.motion.effects.payload import CARRIED
+from ccnn_torch.motion.effects.bodies import CARRIED
+from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.engine import MotionDiagnosis
-from ccnn_torch.motion.models import nominal_of
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.servo import TORQUES, axis_keys
+from ccnn_torch.motion.setting import nominal_of
 from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.plugins import code_refused
-from ccnn_torch.report.json_files import read_json, write_json
+from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.results.base import Number, Result
 
 IDENTIFIED, _MODEL = "identified_motion.json", "identified.xml"
 # What an MJCF can hold of an axis.
@@ -32,6 +33,20 @@ _IN_MJCF = ("gain", "inertia", "load", "viscous", "drive_damping", "coulomb", "w
 _ROUNDING = 1e-12
 
 Axis = Mapping[str, float]
+
+
+class _File(Result):
+    """identified_motion.json, as ccnn diagnose --motion writes it"""
+
+    mechanism: str
+    mechanism_keys: dict[str, Any]
+    units: list[str]
+    effects: list[str]
+    left: list[float]
+    errors: list[float]
+    axes: list[dict[str, float]]
+    supply: Number = None
+    temperature: Number = None
 
 
 class Identified(NamedTuple):
@@ -71,35 +86,35 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     values.pop(CARRIED, None)
     count = len(found.verdicts)
     axes = [{name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]} for i in range(count)]
-    content: dict[str, Any] = {
-        "mechanism": nominal.name,
-        "mechanism_keys": dict(keys),
-        "units": list(data.units),
-        "effects": list(found.content["verdict"]["effects"]),
-        "left": [float(own[data.judged].square().mean().sqrt()) for own in found.after],
-        "errors": [float(own[data.judged].abs().max()) for own in data.command - data.position],
-        "axes": axes,
-    }
+    content = _File(
+        mechanism=nominal.name,
+        mechanism_keys=dict(keys),
+        units=list(data.units),
+        effects=found.verdict["effects"],
+        left=[float(own[data.judged].square().mean().sqrt()) for own in found.after],
+        errors=[float(own[data.judged].abs().max()) for own in data.command - data.position],
+        axes=axes,
+    )
     if "supply" in data.beside:
-        content["supply"] = float((data.beside["supply"] / (1 + found.problem.supply)).nanmedian())
-        nominal = replace(nominal, supply=content["supply"])
+        content.supply = float((data.beside["supply"] / (1 + found.problem.supply)).nanmedian())
+        nominal = replace(nominal, supply=content.supply)
     if "temperature" in data.beside:
-        content["temperature"] = float((data.beside["temperature"] - found.problem.warm).median())
+        content.temperature = float((data.beside["temperature"] - found.problem.warm).median())
     files = [IDENTIFIED]
     if nominal.name == "servo":
-        content["mechanism_keys"] = axis_keys(nominal, axes, _mass(found))
+        content.mechanism_keys = axis_keys(nominal, axes, _mass(found))
     elif nominal.simulator is not None:
         parameters = dict(nominal.simulator.parameters)
         for name, v in own.items():
             parameters[name] += float(v.sum() / (v != 0).sum().clamp_min(1))
-        content["mechanism_keys"] = parameters
+        content.mechanism_keys = parameters
     elif nominal.loaded is not None:
-        from ccnn_torch.motion.mujoco_write import write_mjcf
+        from ccnn_torch.motion.mujoco_motion import write_mjcf
 
         written = [{name: axis.get(name, ABSENT[name]) for name in _IN_MJCF} for axis in axes]
         write_mjcf(nominal.name, folder / _MODEL, written, nominal.gains, _at_tool(found))
-        content["mechanism"] = _MODEL
-        content["axes"] = [_beside(axis) for axis in axes]
+        content.mechanism = _MODEL
+        content.axes = [_beside(axis) for axis in axes]
         files.append(_MODEL)
     write_json(folder / IDENTIFIED, content)
     return files
@@ -115,33 +130,27 @@ def load_identified(path: Path, allow_code: bool = False) -> Identified:
     Raises:
         InputError: it is not there, is no such file, or names a model that is not there or may not run.
     """
-    content = read_json(path)
-    try:
-        mechanism, keys, units = content["mechanism"], dict(content["mechanism_keys"]), list(content["units"])
-        axes = tuple({str(n): float(v) for n, v in axis.items()} for axis in content["axes"])
-        left, effects = tuple(map(float, content["left"])), tuple(map(str, content["effects"]))
-        errors = tuple(map(float, content["errors"]))
-        supply, temperature = (float(content[k]) if content.get(k) else None for k in ("supply", "temperature"))
-        unknown = next((n for axis in axes for n, v in axis.items() if n not in ABSENT or not math.isfinite(v)), None)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: is no {IDENTIFIED}, which ccnn diagnose --motion writes ({error})") from None
+    content = _File.read(path)
+    mechanism, units, axes = content.mechanism, content.units, content.axes
+    unknown = next((n for axis in axes for n, v in axis.items() if n not in ABSENT or not math.isfinite(v)), None)
     if (
         unknown is not None
-        or not len(axes) == len(units) == len(left) == len(errors)
-        or not {*map(str, units)} <= {"rad", "m"}
+        or not len(axes) == len(units) == len(content.left) == len(content.errors)
+        or not {*units} <= {"rad", "m"}
     ):
         what = f"an axis has no number '{unknown}'"
         what = what if unknown else f"{len(axes)} axes for {len(units)} joints in rad or m"
         raise InputError(f"{path}: {what}; write it anew with ccnn diagnose --motion")
-    beside = path.parent / str(mechanism)
-    name = str(beside) if mechanism == _MODEL else str(mechanism)
+    name = str(path.parent / mechanism) if mechanism == _MODEL else mechanism
     with code_refused(f"{path}: its simulator", allow_code):
-        nominal = nominal_of(name, keys, units)
-    if nominal.name != "servo":
-        axes = tuple({**axis, **own} for axis, own in zip(axes, nominal.axes, strict=True))
-    own = nominal.axes if nominal.name == "servo" else axes
-    nominal = replace(nominal, supply=supply or nominal.supply)
-    return Identified(nominal, own, left, effects, tuple(units), errors, temperature)
+        nominal = nominal_of(name, content.mechanism_keys, units)
+    if nominal.name == "servo":
+        own = nominal.axes
+    else:
+        own = tuple({**axis, **of_model} for axis, of_model in zip(axes, nominal.axes, strict=True))
+    nominal = replace(nominal, supply=content.supply or nominal.supply)
+    left, effects, errors = tuple(content.left), tuple(content.effects), tuple(content.errors)
+    return Identified(nominal, own, left, effects, tuple(units), errors, content.temperature or None)
 
 
 def _beside(axis: Axis) -> dict[str, float]:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ccnn_torch.effects.registry import is_number, name_breaches
+from ccnn_torch.errors import InputError
 from ccnn_torch.motion.effects import Facts, MotionEffect, Number
-from ccnn_torch.motion.effects.checked import refuse_wrong_effect
-from ccnn_torch.motion.effects.cogging import FEWEST
-from ccnn_torch.motion.effects.own_parameter import OWN
+from ccnn_torch.motion.effects.bodies import CARRIED
+from ccnn_torch.motion.effects.gears import FEWEST
+from ccnn_torch.motion.effects.protocol import Act
+from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.stage import ABSENT
+from ccnn_torch.plugins import users_code
+from ccnn_torch.spelling import nearest
 
 # What may not be below 0, and what not above.
 _POSITIVE = (
@@ -142,6 +147,48 @@ class Library(NamedTuple):
             if name in found:
                 found[name] = found[name].clamp(0, _MOST.get(name, math.inf))
         return found
+
+
+def refuse_wrong_effect(effect: MotionEffect, facts: Sequence[Facts]) -> None:
+    """Raise `InputError` where an effect does not keep to `MotionEffect` on the axes of a machine."""
+    for i, axis in enumerate(facts):
+        where = f"effect '{effect.name}', joint {i + 1}"
+        parts: dict[str, Any] = {}
+        for call in ("missing", "numbers", "shapes"):
+            with users_code(where, f"{call} "):
+                parts[call] = getattr(effect, call)(axis)
+        for breach in _breaches(**parts):
+            raise InputError(f"{where}: {breach}")
+
+
+def _breaches(missing: object, numbers: Sequence[object], shapes: Any) -> Iterator[str]:
+    """What the answers of an effect break of `MotionEffect`, one sentence each without a full stop."""
+    if not isinstance(missing, str):
+        yield f"missing must return a text, empty where nothing lacks, not {missing!r}"
+    strange = [number for number in numbers if not isinstance(number, Number)]
+    if strange or not numbers:
+        yield f"numbers must return at least one Number, and nothing else{f', not {strange[0]!r}' if strange else ''}"
+    known = [number for number in numbers if isinstance(number, Number)]
+    yield from name_breaches([number.name for number in known], "numbers")
+    for number in known:
+        if not (is_number(number.scale) and number.scale > 0 and is_number(number.start)):
+            yield f"'{number.name}' needs a finite scale above 0 and a finite start"
+        for act in number.acts:
+            fine = isinstance(act, Act) and act.how in ("add", "factor") and is_number(act.factor)
+            if not fine or not (act.parameter in ABSENT or act.parameter == CARRIED or act.parameter.startswith(OWN)):
+                near = nearest(act.parameter, list(ABSENT)) if isinstance(act, Act) else None
+                hint = f"; '{near}' is the nearest" if near else ""
+                yield f"'{number.name}' acts by {act!r}, which is on no parameter of an axis{hint}"
+    if not isinstance(shapes, Sequence) or not shapes or not all(isinstance(s, Mapping) for s in shapes):
+        yield f"shapes must return at least one dict, which may be empty, not {shapes!r}"
+    names = {number.name for number in known}
+    for key, value in (item for shape in shapes for item in shape.items()):
+        meant = key in names or (key in ABSENT and value is not None)
+        if not meant or not (value is None or is_number(value)):
+            yield (
+                f"the shape {{'{key}': {value}}} is neither a start of one of its numbers nor a finite value of a "
+                "parameter of an axis"
+            )
 
 
 def _kinds(numbers: Sequence[Number]) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects.constant import PARAMETER
-from ccnn_torch.motion.effects.own_parameter import OWN
+from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.fit import fit_many
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.nominal import Nominal

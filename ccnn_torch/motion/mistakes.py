@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,30 +33,37 @@ _TURNED_LAG, _TURNED_SHARE = 1.0, 0.5
 
 def refuse_mistakes(logs: Sequence[Log]) -> None:
     """Raise `InputError` with one sentence where the logs cannot be what their headers say."""
+    for mistake in _mistakes(logs):
+        raise InputError(mistake)
+
+
+def _mistakes(logs: Sequence[Log]) -> Iterator[str]:
+    """What is wrong with the logs, in the order in which it is looked for; each rests on what is before it."""
     names = ", ".join(log.name for log in logs)
-    if not any(log.on.any() for log in logs):
-        raise InputError(f"{names}: the drive was off throughout (torque_on); record a motion with the drive on")
     usable = [log for log in logs if log.on.sum() > 1]
+    if not any(log.on.any() for log in logs):
+        yield f"{names}: the drive was off throughout (torque_on); record a motion with the drive on"
     lasted = sum(float(np.diff(log.time)[log.on[1:]].sum()) for log in usable)
     samples = sum(int(log.on.sum()) for log in usable)
     if lasted < _SHORTEST or samples < _FEWEST:
-        raise InputError(
+        yield (
             f"{names}: {samples} samples in {lasted:.3g} s with the drive on are too few; record at least {_FEWEST} "
             f"samples in {_SHORTEST:g} s, better ten times as many"
         )
-    _refuse_spacing(usable)
+    for log in usable:
+        yield from _too_far_apart(log)
     command = np.concatenate([log.command[log.on] for log in usable])
     position = np.concatenate([log.position[log.on] for log in usable])
     still = [f"command{i + 1}" for i in range(command.shape[1]) if np.ptp(command[:, i]) == 0]
     if len(still) == command.shape[1]:
-        raise InputError(f"{names}: no command moves ({', '.join(still)}); record a motion")
-    _refuse_units(names, command, position)
-    _refuse_swapped(names, command, position)
-    _refuse_turned(usable)
+        yield f"{names}: no command moves ({', '.join(still)}); record a motion"
+    for rule in (_wrong_units, _swapped):
+        yield from (f"{names}: {mistake}" for mistake in rule(command, position))
+    yield from _turned(usable)
     for log in usable:
         for i in range(command.shape[1]):
             if np.ptp(log.position[log.on, i]) == 0 and np.ptp(log.command[log.on, i]) > 0:
-                raise InputError(
+                yield (
                     f"{log.name}: q{i + 1} never moves while command{i + 1} does; check the encoder's column, or leave "
                     "this log out"
                 )
@@ -64,7 +71,7 @@ def refuse_mistakes(logs: Sequence[Log]) -> None:
     pairs = zip(longest.command[longest.on].T, longest.position[longest.on].T, strict=True)
     lag = max(lag_of(longest.time, u, q) for u, q in pairs)
     if lag * _LAGS > lasted:
-        raise InputError(
+        yield (
             f"{names}: the position lags {lag:.3g} s behind the command, and the log lasts {lasted:.3g} s; record at "
             f"least {_LAGS * lag:.2g} s"
         )
@@ -89,18 +96,17 @@ def _likeness(command: Array, position: Array) -> Array:
     return found
 
 
-def _refuse_spacing(logs: Sequence[Log]) -> None:
-    for log in logs:
-        step = float(np.median(np.diff(log.time)))
-        if step > _SPACING:
-            unit = next(unit for unit, beyond in _SMALLER.items() if step > beyond)
-            raise InputError(
-                f"{log.name}: its samples are {step:.3g} s apart, which shows no motion; if the times are in {unit}, "
-                f"write time[{unit}], else record at least {1 / _SPACING:.0f} samples in a second"
-            )
+def _too_far_apart(log: Log) -> Iterator[str]:
+    step = float(np.median(np.diff(log.time)))
+    if step > _SPACING:
+        unit = next(unit for unit, beyond in _SMALLER.items() if step > beyond)
+        yield (
+            f"{log.name}: its samples are {step:.3g} s apart, which shows no motion; if the times are in {unit}, "
+            f"write time[{unit}], else record at least {1 / _SPACING:.0f} samples in a second"
+        )
 
 
-def _refuse_turned(logs: Sequence[Log]) -> None:
+def _turned(logs: Sequence[Log]) -> Iterator[str]:
     for i in range(logs[0].command.shape[1]):
         # Where the joint moves most.
         log = max(logs, key=lambda log: float(np.ptp(log.command[log.on, i])))
@@ -109,37 +115,36 @@ def _refuse_turned(logs: Sequence[Log]) -> None:
         late = like[: max(int(_TURNED_LAG / float(np.median(np.diff(log.time)))), 1)]
         far = np.std(position) > _TURNED_SHARE * np.std(command)
         if far and like[0] < -_WELL and float(late.max()) < -like[0] - _MORE:
-            raise InputError(
+            yield (
                 f"{log.name}: q{i + 1} moves against command{i + 1}; multiply one of them by -1, so that both count in "
                 "one direction"
             )
 
 
-def _refuse_units(names: str, command: Array, position: Array) -> None:
+def _wrong_units(command: Array, position: Array) -> Iterator[str]:
     for i in range(command.shape[1]):
-        c, q = (float(np.std(np.diff(v[:, i]))) for v in (command, position))
+        steps = [float(np.std(np.diff(v[:, i]))) for v in (command, position)]
         far = [float(np.std(v[:, i])) for v in (command, position)]
-        if not c or not q or not min(far):
+        if not min(*steps, *far):
             continue
         for factor, (small, large) in _UNITS.items():
             for ratio, first, second in ((far[1] / far[0], "q", "command"), (far[0] / far[1], "command", "q")):
                 if factor / _SLACK < ratio < factor * _SLACK:
-                    raise InputError(
-                        f"{names}: {first}{i + 1} moves {ratio:.3g} times as far as {second}{i + 1}: one of them is in "
-                        f"{small} and not in {large}; correct the unit in its header"
+                    yield (
+                        f"{first}{i + 1} moves {ratio:.3g} times as far as {second}{i + 1}: one of them is in {small} "
+                        f"and not in {large}; correct the unit in its header"
                     )
 
 
-def _refuse_swapped(names: str, command: Array, position: Array) -> None:
-    n = command.shape[1]
-    moving = [i for i in range(n) if np.ptp(command[:, i]) and np.ptp(position[:, i])]
+def _swapped(command: Array, position: Array) -> Iterator[str]:
+    moving = [i for i in range(command.shape[1]) if np.ptp(command[:, i]) and np.ptp(position[:, i])]
     if len(moving) < 2:
         return
     like = np.corrcoef(command[:, moving].T, position[:, moving].T)[: len(moving), len(moving) :]
     for a, i in enumerate(moving):
         b = int(np.argmax(like[:, a]))
         if b != a and like[b, a] > _WELL and like[b, a] > like[a, a] + _MORE and like[a, b] > like[b, b] + _MORE:
-            raise InputError(
-                f"{names}: q{i + 1} follows command{moving[b] + 1} and q{moving[b] + 1} follows command{i + 1}; the "
-                "columns of two joints are swapped"
+            yield (
+                f"q{i + 1} follows command{moving[b] + 1} and q{moving[b] + 1} follows command{i + 1}; the columns of "
+                "two joints are swapped"
             )

@@ -1,15 +1,18 @@
-"""The motion of an MJCF under commands, and the torques that weights, the other joints and a payload make on it."""
+"""MuJoCo models in motion: as a nominal model, what loads their motors, and the model with what was identified."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.nominal import Loaded
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.mechanisms.simulators.mujoco_model import compiled, mujoco_spec
+from ccnn_torch.motion.nominal import Loaded, Nominal
 
 Array = NDArray[np.float64]
 # Seconds at the first command before a log begins: the machine rests there.
@@ -185,3 +188,115 @@ def _resisting(
     gain = model.actuator_gainprm[: len(joints), 0]
     pulled = np.gradient(speed, time, axis=0) - model.opt.gravity
     return torque - own["inertia"] * gain * motion.acceleration[:, dofs], (bent * pulled).sum(-1)
+
+
+def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> Nominal:
+    """The model of an MJCF whose actuators hold the positions of joints, one for each command in their order.
+
+    Raises:
+        InputError: MuJoCo is not installed, the model cannot be read, or it has other actuators.
+    """
+    if keys:
+        raise InputError(f"mechanism_keys: an MJCF takes none, and {', '.join(keys)} was given; write it in {path}")
+    mujoco, spec = mujoco_spec(path)
+    model = compiled(mujoco, path, spec)
+    held = [k for k in range(model.nu) if model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT]
+    position = [k for k in held if model.actuator_biasprm[k, 1] < 0 and model.actuator_gainprm[k, 0] > 0]
+    if len(position) != model.nu or model.nu != len(units):
+        raise InputError(
+            f"{path}: has {model.nu} actuators, {len(position)} of which hold the position of a joint, and the logs "
+            f"have {len(units)} commands; give it one <position joint=…/> for each command, in their order"
+        )
+    joints = [int(model.actuator_trnid[k, 0]) for k in position]
+    own = ["m" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE else "rad" for j in joints]
+    if own != list(units):
+        raise InputError(f"{path}: its joints are in {', '.join(own)}, and the logs in {', '.join(units)}")
+    if any(model.actuator_gear[k, 0] != 1 for k in position):
+        raise InputError(f"{path}: an actuator has a gear; give it gear 1, so that its command is the joint's position")
+    dofs = [int(model.jnt_dofadr[j]) for j in joints]
+    gain, limit = model.actuator_gainprm[position, 0], model.actuator_forcerange[position, 1]
+    values = {
+        "inertia": model.dof_M0[dofs] / gain,
+        "load": (model.dof_M0[dofs] - model.dof_armature[dofs]) / gain,
+        "viscous": (model.dof_damping[dofs] - model.actuator_biasprm[position, 2]) / gain,
+        "drive_damping": -model.actuator_biasprm[position, 2] / gain,
+        "coulomb": model.dof_frictionloss[dofs] / gain,
+        "weakness": model.actuator_forcelimited[position] * gain / np.maximum(limit, NONE),
+    }
+    return Nominal(
+        path,
+        tuple({name: float(v[i]) for name, v in values.items() if v[i]} for i in range(len(joints))),
+        tuple(gain.tolist()),
+        (None,) * len(joints),
+        heaviest=float(model.body_mass.sum()),
+        loaded=lambda time, commands, measured: loaded_motion(path, model, joints, values, time, commands, measured),
+        notes=(f"{Path(path).name}: simulated from rest at each log's first command",),
+    )
+
+
+# No body is lighter [kg].
+_LEAST = 1e-9
+
+
+def write_mjcf(
+    source: str,
+    path: Path,
+    axes: Sequence[Mapping[str, float]],
+    gains: Sequence[float | None],
+    added: float,
+) -> None:
+    """Write a copy of a model with new gains, damping, friction loss, armature, force range and masses.
+
+    Args:
+        source: the MJCF.
+        path: of the copy; meshes and textures are looked for where they were.
+        axes: `gain`, `inertia`, `viscous`, `coulomb`, `weakness` of each actuator's joint, over its gain in `source`.
+        gains: those gains [N m/rad].
+        added: mass at the tool (that of the last joint, `tools_of`) beyond that of `source` [kg].
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec.from_file(source)
+    model = spec.compile()
+    joints = [int(number) for number in model.actuator_trnid[: len(axes), 0]]
+    for k, (axis, gain) in enumerate(zip(axes, gains, strict=True)):
+        unit = gain or 1.0
+        joint = next(j for j in spec.joints if j.id == joints[k])
+        dof = int(model.jnt_dofadr[joints[k]])
+        actuator = spec.actuators[k]
+        # The gain stands for itself and for the position's part of the force.
+        actuator.gainprm[0], actuator.biasprm[1] = unit * axis["gain"], -unit * axis["gain"]
+        kv = -float(model.actuator_biasprm[k, 2])
+        damping = np.asarray(joint.damping, dtype=np.float64)
+        new = max(unit * axis["viscous"] - kv, 0.0)
+        joint.damping = [new, *damping[1:]] if damping.ndim else new
+        joint.frictionloss = unit * axis["coulomb"]
+        more = unit * axis["inertia"] - float(model.dof_M0[dof])
+        joint.armature = max(float(model.dof_armature[dof]) + more, 0.0)
+        if axis["weakness"]:
+            most = unit / axis["weakness"]
+            actuator.forcelimited, actuator.forcerange = 1, [-most, most]
+    if added:
+        _loaded(spec, model, tools_of(model, joints)[-1], added)
+    spec.modelfiledir = str(Path(source).resolve().parent)
+    write_whole(path, spec.to_xml())
+
+
+def _loaded(spec: Any, model: Any, tool: Tool, added: float) -> None:
+    """Give the tool's body the mass, centre and inertia that it has with a point mass."""
+    import mujoco
+
+    body = next(b for b in spec.bodies if b.id == tool.body)
+    mass, centre, turn = float(model.body_mass[tool.body]), model.body_ipos[tool.body], np.empty(9)
+    mujoco.mju_quat2Mat(turn, model.body_iquat[tool.body])
+    axes = turn.reshape(3, 3)
+    added = max(added, _LEAST - mass)
+    between, reduced = tool.place - centre, mass * added / (mass + added)
+    inertia = axes @ np.diag(model.body_inertia[tool.body]) @ axes.T
+    inertia += reduced * (between @ between * np.eye(3) - np.outer(between, between))
+    # No more than is there can be taken away.
+    sizes, turned = np.linalg.eigh(inertia)
+    inertia = (turned * np.maximum(sizes, _LEAST)) @ turned.T
+    body.explicitinertial, body.mass = True, mass + added
+    body.ipos = centre + added / (mass + added) * between
+    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.motion.axis import Drive, simulate_axes
-from ccnn_torch.motion.effects.own_parameter import OWN
-from ccnn_torch.motion.effects.payload import CARRIED
+from ccnn_torch.motion.effects.bodies import CARRIED
+from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.stretches import Stretches
 from ccnn_torch.motion.whiten import Whitening

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
+from ccnn_torch.motion.effects.bodies import STANDARD_GRAVITY
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.spelling import nearest

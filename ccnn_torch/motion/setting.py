@@ -1,19 +1,26 @@
-"""Logs and a nominal model as what is fitted."""
+"""Logs and a nominal model by its name, as what is fitted."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.read import CONFIG_LIMIT, read_text
+from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.motion.effects import Facts, MotionEffect
 from ccnn_torch.motion.library import library_of
 from ccnn_torch.motion.log import Log
-from ccnn_torch.motion.nominal import Driven, Nominal
+from ccnn_torch.motion.nominal import Driven, Nominal, own_simulator
 from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.servo import servo
 from ccnn_torch.motion.stretches import Stretches, cut_stretches
+from ccnn_torch.plugins import is_plugin
 
 # Seconds over which samples are averaged before they are judged.
 _POOLED = 0.02
@@ -68,3 +75,34 @@ def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Te
         supply=float(supply[judged].abs().max()) if "supply" in data.beside else 0.0,
         temperature=max(float(v.max() - v.min()) for v in runs),
     )
+
+
+def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) -> Nominal:
+    """The nominal model by its name.
+
+    Args:
+        mechanism: `servo`, a simulator `file.py:NAME`, an MJCF with position actuators, or a mechanism.
+        keys: of the built-in servo (`KEYS`), or of the mechanism.
+        units: of the joints in the logs.
+
+    Raises:
+        InputError: a name or a key is not known, or the model has another number of joints than the logs.
+    """
+    n = len(units)
+    if mechanism == "servo":
+        return servo(keys, n)
+    nothing = Nominal(mechanism, ({},) * n, (None,) * n, (None,) * n)
+    if is_plugin(mechanism):
+        return replace(nothing, simulator=own_simulator(mechanism, keys))
+    if Path(mechanism).suffix.lower() in (".xml", ".mjcf") and Path(mechanism).is_file():
+        from ccnn_torch.motion.mujoco_motion import mujoco_nominal
+
+        if "<mujoco" in read_text(mechanism, CONFIG_LIMIT, "write an MJCF"):
+            return mujoco_nominal(mechanism, keys, units)
+    own = [joint.unit for joint in load_mechanism(mechanism, **keys).joints]
+    if own != list(units):
+        raise InputError(
+            f"{mechanism}: has {len(own)} joints ({', '.join(own)}), and the logs {len(units)} ({', '.join(units)}); "
+            "name the commands command1… and the positions q1… in the mechanism's order"
+        )
+    return nothing

@@ -5,20 +5,20 @@ determinant and the inverse instead of computing them anew; here a pose has c ro
 the effect of every candidate is known at once. The exchange is that of Cook and Nachtsheim (1980): each chosen pose in
 turn is exchanged for the best of all candidates, until no exchange improves the design.
 
-With information A, V = A⁻¹ and rows J_i of candidate i, W_ij = J_i V J_jᵀ (c x c):
-adding i multiplies det A by det(I + W_ii); exchanging j for i multiplies it by
+With the covariance V and rows J_i of candidate i, W_ij = J_i V J_jᵀ (c x c): exchanging j for i multiplies the
+determinant of the information by
 det(I + W_ii) · det(I - W_jj + W_ji (I + W_ii)⁻¹ W_ij). Taking the addition first never divides by a singular matrix.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.identification.problems.problem import Progress
-from ccnn_torch.planning.small_matrices import forward_substitute, log_determinant, small_cholesky
+from ccnn_torch.numerics.designs import Candidates, forward_substitute, log_determinant, small_cholesky, spread_of, unit
 
 # A gain of the determinant's logarithm that counts, against rounding and endless exchanges.
 _GAIN = 1e-9
@@ -29,42 +29,24 @@ _SWEEPS = 50
 
 
 @dataclass
-class Design:
+class Design(Candidates):
     """Poses chosen so far, and what each candidate would add. Changes in place.
 
     Attributes:
-        rows: `c x k x M` [1], in coordinates in which all candidates together give about the same information in every
-            direction. The candidates come last so that all work on them is on whole vectors.
         prior: information that is there without any pose, `k x k`.
         chosen: numbers of the chosen candidates, in order.
-        free: `M`, bool; which may still be chosen.
-        inverse: V, `k x k`.
-        spread: W_ii of all candidates, `c x c x M`.
+        free: `M`, bool; which may still be chosen; empty where each may be chosen again.
     """
 
-    rows: Tensor
-    prior: Tensor
-    chosen: list[int]
-    free: Tensor
-    inverse: Tensor
-    spread: Tensor
+    prior: Tensor = field(default_factory=lambda: torch.zeros(0, 0))
+    chosen: list[int] = field(default_factory=list)
+    free: Tensor = field(default_factory=lambda: torch.ones(0, dtype=torch.bool))
 
     def refresh(self) -> None:
         """Compute inverse and spread anew, which rids them of the rounding of the updates."""
         own = self.rows[:, :, self.chosen].movedim(1, -1).flatten(0, 1)
         self.inverse = torch.cholesky_inverse(torch.linalg.cholesky(self.prior + own.mT @ own))
-        self.spread = torch.stack([((self.inverse @ row) * self.rows).sum(1) for row in self.rows])
-
-    def change(self, candidate: int, sign: int) -> None:
-        """Add a candidate's information (sign 1) or take it away (-1): an update of rank c."""
-        own = self.rows[:, :, candidate]
-        carried = own @ self.inverse
-        middle = torch.eye(len(own), dtype=own.dtype) + sign * carried @ own.mT
-        step = torch.linalg.solve_triangular(torch.linalg.cholesky(middle), carried, upper=False)
-        self.inverse = self.inverse - sign * step.mT @ step
-        moved = step @ self.rows
-        for a in range(len(moved)):
-            self.spread[a].sub_((moved[a] * moved).sum(1), alpha=sign)
+        self.spread = spread_of(self.rows, self.inverse)
 
 
 def make_design(rows: Tensor, prior: Tensor | None = None, repeat: bool = False) -> Design:
@@ -79,16 +61,15 @@ def make_design(rows: Tensor, prior: Tensor | None = None, repeat: bool = False)
     c, k, count = across.shape
     if prior is None:
         prior = _RIDGE * (across.square().sum() / (count * k)) * torch.eye(k, dtype=rows.dtype)
-    free = torch.ones(count, dtype=torch.bool)
-    design = Design(across, prior, [], free, torch.empty(k, k), torch.empty(c, c, count))
-    design.free = free if not repeat else torch.ones(0, dtype=torch.bool)
+    free = torch.ones(0 if repeat else count, dtype=torch.bool)
+    design = Design(across, torch.empty(k, k), torch.empty(c, c, count), prior=prior, free=free)
     design.refresh()
     return design
 
 
 def add_best(design: Design) -> float:
     """Add the candidate that makes the determinant largest; returns how much its logarithm grew."""
-    gain = log_determinant(small_cholesky(design.spread + _unit(design.spread)))
+    gain = design.information()
     best = int(_allowed(design, gain).argmax())
     design.change(best, 1)
     _choose(design, best)
@@ -112,7 +93,7 @@ def exchange(design: Design, progress: Progress | None = None) -> bool:
 def _exchange_one(design: Design, place: int) -> bool:
     """Exchange the pose at `place` for the best candidate, if that is a gain."""
     old = design.chosen[place]
-    factor = small_cholesky(design.spread + _unit(design.spread))
+    factor = design.factor
     added = _allowed(design, log_determinant(factor))
     # An exchange gains at most what the addition does: only candidates that add more than the best exchange found so
     # far need to be evaluated.
@@ -144,7 +125,7 @@ def _exchange_gain(design: Design, old: int, new: Tensor, factor: Tensor, added:
     cross = (design.rows[:, :, old] @ design.inverse) @ rows
     back = forward_substitute(factors, cross)
     own = design.spread[:, :, old, None]
-    left = torch.stack([row + (back[:, a, None] * back).sum(0) for a, row in enumerate(_unit(own) - own)])
+    left = torch.stack([row + (back[:, a, None] * back).sum(0) for a, row in enumerate(unit(own) - own)])
     gain = log_determinant(small_cholesky(left))
     return added[new] + (gain[new] if everything else gain)
 
@@ -152,7 +133,7 @@ def _exchange_gain(design: Design, old: int, new: Tensor, factor: Tensor, added:
 def removal_loss(design: Design) -> Tensor:
     """Loss of the determinant's logarithm when each chosen pose is removed, `N`; inf if it is needed."""
     own = design.spread[..., design.chosen]
-    return -log_determinant(small_cholesky(_unit(own) - own))
+    return -log_determinant(small_cholesky(unit(own) - own))
 
 
 def order_by_worth(rows: Tensor, prior: Tensor) -> tuple[list[int], int]:
@@ -167,7 +148,7 @@ def order_by_worth(rows: Tensor, prior: Tensor) -> tuple[list[int], int]:
     """
     across = rows.permute(1, 2, 0).contiguous()
     k = across.shape[1]
-    design = Design(across, prior, list(range(len(rows))), torch.ones(0, dtype=torch.bool), prior, across)
+    design = Design(across, prior, across, prior=prior, chosen=list(range(len(rows))))
     last: list[int] = []
     while len(design.chosen) > 1 and len(design.chosen) * len(across) > k - int(torch.linalg.matrix_rank(prior)):
         design.refresh()
@@ -192,10 +173,6 @@ def tightest_bound(design: Design) -> float:
     k, count = design.inverse.shape[0], len(design.chosen)
     largest = float(design.spread.diagonal(dim1=0, dim2=1).sum(-1).max()) * count
     return min(1.0, float(torch.exp(torch.tensor(1 - largest / k))))
-
-
-def _unit(spread: Tensor) -> Tensor:
-    return torch.eye(len(spread), dtype=spread.dtype)[:, :, None]
 
 
 def _allowed(design: Design, gain: Tensor) -> Tensor:

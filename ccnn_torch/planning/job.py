@@ -19,11 +19,11 @@ from ccnn_torch.identification.problems.problem import Progress
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.planning import Plan, plan_poses
 from ccnn_torch.planning.config import PlanConfig
-from ccnn_torch.planning.figure import plan_plot
-from ccnn_torch.planning.page import plan_markdown
+from ccnn_torch.planning.page import plan_page, plan_plot
 from ccnn_torch.records import write_table
 from ccnn_torch.records.joint_map import read_joint_map
-from ccnn_torch.report.figures.style import save_figure
+from ccnn_torch.report.figures.style import inline_svg, save_figure
+from ccnn_torch.report.page import InlineFigure, Section
 from ccnn_torch.units import from_si, split_header
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ def check_plan_file(path: Path) -> None:
 def write_plan(
     path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: float, config: PlanConfig | None = None
 ) -> list[Path]:
-    """Write the poses as CSV, and beside it a page (.md) with its picture (.png, .svg).
+    """Write the poses as CSV, and beside it a page (.html, .md) with its picture (.png, .svg).
 
     The CSV has a row for each pose: `leg[1]` where each leg has its own, the joints to command, and the pose at which
     they bring the nominal machine; the most informative rows come first. With a `joint_map` of the config the joints
@@ -102,10 +102,14 @@ def write_plan(
     make_folder(path.parent)
     write_table(path, columns)
     plot = plan_plot(mechanism.pose, plans, least_gain)
-    pictures = save_figure(plot.figure, path)
-    page = path.with_suffix(".md")
-    write_whole(page, plan_markdown(mechanism.name, plans, least_gain, pictures[0].name, plot.caption))
-    return [path, page, *pictures]
+    png, svg = save_figure(plot.figure, path)
+    drawn = InlineFigure(plot.name, plot.caption, inline_svg(svg.read_text(encoding="utf-8"), plot.name))
+    linked = Section(sentences=[f"![{plot.caption}]({png.name})", plot.caption])
+    page, text = path.with_suffix(".html"), path.with_suffix(".md")
+    write_whole(text, plan_page(mechanism.name, plans, least_gain, [linked]).markdown())
+    shown = plan_page(mechanism.name, plans, least_gain, [Section(figures=[drawn])])
+    write_whole(page, shown.html([path.name, text.name]))
+    return [path, page, text, png, svg]
 
 
 def _commands(columns: Mapping[str, Array], mechanism: Mechanism, config: PlanConfig) -> dict[str, Array]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -18,6 +17,7 @@ from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.effects import Facts, MotionEffect, motion_effects
 from ccnn_torch.motion.library import library_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.testing.learner import global_random_state
 
 _ROWS = 8
 # Differences of `reached` over this share of a plausible size, and how well they fit what is to be linear [1].
@@ -38,15 +38,13 @@ def check_effect(effect: str | Callable[[], Effect], mechanism: Mechanism | str 
     Raises:
         AssertionError: one sentence with the mistake; with the line where the effect's code raised.
     """
-    before = (torch.random.get_rng_state(), random.getstate())
+    before = global_random_state()
     try:
         made = _made(effect)
         _check(made, load_mechanism(mechanism) if isinstance(mechanism, str) else mechanism, seed)
     except InputError as reason:
         raise AssertionError(str(reason)) from reason
-    after = (torch.random.get_rng_state(), random.getstate())
-    untouched = torch.equal(before[0], after[0]) and before[1] == after[1]
-    _require(untouched, made, "changes a global random state; an effect has none of its own")
+    _require(global_random_state() == before, made, "changes a global random state; an effect has none of its own")
 
 
 def _made(effect: str | Callable[[], Effect]) -> OwnEffect:

@@ -30,9 +30,9 @@ def check_learner(factory: Callable[[], Learner], rows: int = 40) -> None:
     for repeats in (1, 3):
         data = _data(repeats, rows)
         untouched = _data(repeats, rows)
-        before = _global_random_state()
+        before = global_random_state()
         learner = _check_training(factory, data)
-        _require(_global_random_state() == before, "training changes a global random state; draw from data.seeds only")
+        _require(global_random_state() == before, "training changes a global random state; draw from data.seeds only")
         for part, expected in ((data.inputs, untouched.inputs), (data.targets, untouched.targets)):
             _require(torch.equal(part, expected), "training changes the data it was given")
         _check_network(learner, data)
@@ -237,7 +237,8 @@ def _check_same(one: Learner, other: Learner, data: TrainingData, sentence: str)
     _require(torch.equal(one.predict(data.inputs), other.predict(data.inputs)), f"{sentence}: other predictions")
 
 
-def _global_random_state() -> tuple[object, ...]:
+def global_random_state() -> tuple[object, ...]:
+    """Of torch, Python and numpy, to be compared."""
     numpy_state = np.random.get_state()  # noqa: NPY002 - the global state is what must stay untouched
     return (
         bytes(torch.random.get_rng_state().tolist()),

@@ -13,9 +13,9 @@ from _machines import NOISE, acting, cramped, measured, reached_with, rows_of
 from torch import Tensor
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
-from ccnn_torch.diagnosis.design.next_measurements import _candidates, _columns, _possible
+from ccnn_torch.diagnosis.next_measurements import _candidates, _columns, _possible
 from ccnn_torch.diagnosis.page.data import About
-from ccnn_torch.diagnosis.page.localisation import write_next_csv
+from ccnn_torch.diagnosis.page.tables import write_next_csv
 from ccnn_torch.effects import Situation
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.evidence.dictionary import FittedSet, covariance

@@ -14,9 +14,7 @@ from frozen import frozen
 from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.diagnosis import Diagnosis
 from ccnn_torch.diagnosis.page.data import About
-from ccnn_torch.diagnosis.page.first_screen import first_screen
-from ccnn_torch.diagnosis.page.numbers import numbers_table
-from ccnn_torch.diagnosis.page.place_words import where_words
+from ccnn_torch.diagnosis.page.first_screen import first_screen, numbers_table, where_words
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.records import write_table
 from ccnn_torch.report.json_files import plain

@@ -8,7 +8,7 @@ import pytest
 import torch
 from _machines import measured, rows_of
 
-from ccnn_torch.diagnosis.checks.order_of_rows import directions_of_order
+from ccnn_torch.diagnosis.checks.unrecorded import directions_of_order
 from ccnn_torch.diagnosis.engine import diagnose_rows
 
 

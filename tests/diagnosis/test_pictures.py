@@ -10,7 +10,7 @@ import torch
 from _machines import NOISE, measured, rows_of
 
 from ccnn_torch.diagnosis import diagnose_rows
-from ccnn_torch.diagnosis.page.arrays import picture_arrays
+from ccnn_torch.diagnosis.page.outputs import picture_arrays
 from ccnn_torch.effects import Situation, default_gravity, pose_residual, reached
 from ccnn_torch.mechanisms import load_mechanism
 

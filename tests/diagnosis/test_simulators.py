@@ -14,7 +14,7 @@ import torch
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, situation_of
 from ccnn_torch.diagnosis.checks.identifiable import check_rows
-from ccnn_torch.diagnosis.page.check import check_text
+from ccnn_torch.diagnosis.page.report import check_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records, write_table

@@ -14,7 +14,7 @@ from motion.servo import command
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox, mujoco_simulator
 from ccnn_torch.motion import load_logs
-from ccnn_torch.motion.mujoco_model import mujoco_nominal
+from ccnn_torch.motion.mujoco_motion import mujoco_nominal
 from ccnn_torch.records import write_table
 from fuzz.mutate import change_table, change_text, table_changes, text_changes
 from fuzz.oracle import limited

@@ -16,6 +16,7 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import ParameterChoice, Problem, inverse_problem, solve_lm
 from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.numerics.designs import forward_substitute, log_determinant, small_cholesky
 from ccnn_torch.planning import (
     choose_poses,
     draw_candidates,
@@ -33,7 +34,6 @@ from ccnn_torch.planning.design import (
     removal_loss,
     tightest_bound,
 )
-from ccnn_torch.planning.small_matrices import forward_substitute, log_determinant, small_cholesky
 
 
 def draw(seed: int, *shape: int) -> Tensor:

@@ -10,7 +10,7 @@ import pytest
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import mujoco_simulator
 from ccnn_torch.mechanisms.simulators.mujoco_model import compiled, mujoco_spec
-from ccnn_torch.motion.mujoco_model import mujoco_nominal
+from ccnn_torch.motion.mujoco_motion import mujoco_nominal
 
 pytest.importorskip("mujoco", reason="needs pip install 'ccnn-torch[mujoco]'")
 MODEL = """<mujoco><option timestep="0.002"/><worldbody><body><joint name="j1" axis="0 1 0" damping="0.1"/>

@@ -21,8 +21,8 @@ from ccnn_torch.motion import (
     nominal_of,
     write_identified,
 )
-from ccnn_torch.motion.mujoco_write import write_mjcf as write_new_values
-from ccnn_torch.motion.simulators import Simulator
+from ccnn_torch.motion.mujoco_motion import write_mjcf as write_new_values
+from ccnn_torch.motion.nominal import Simulator
 from ccnn_torch.records import write_table
 
 OWN = """

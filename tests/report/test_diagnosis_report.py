@@ -19,24 +19,22 @@ from rich.console import Console
 from test_run_report import Page
 
 from ccnn_torch.diagnosis.page.data import About, about_of, signatures_of
-from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
-from ccnn_torch.diagnosis.page.figure_signature import signature_plot
-from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
-from ccnn_torch.diagnosis.page.localisation import (
+from ccnn_torch.diagnosis.page.figure_rows import signature_plot
+from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot, remainder_map, where_plot
+from ccnn_torch.diagnosis.page.report import diagnosis_page, print_diagnosis, write_diagnosis_report
+from ccnn_torch.diagnosis.page.tables import (
     aside_table,
+    confusable_table,
+    effect_table,
+    gap_table,
     next_table,
+    order_table,
+    parameter_table,
     quantity_text,
     region_table,
     shares,
     where_table,
-)
-from ccnn_torch.diagnosis.page.report import diagnosis_page, print_diagnosis, write_diagnosis_report
-from ccnn_torch.diagnosis.page.tables import (
-    confusable_table,
-    effect_table,
-    gap_table,
-    order_table,
-    parameter_table,
+    write_next_csv,
 )
 from ccnn_torch.diagnosis.verdict.text import (
     aside_text,
@@ -59,6 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("diagnosis")
     results, arrays, labels = indistinguishable()
     write_json(folder / "diagnosis.json", results)
+    write_next_csv(folder / "next_measurements.csv", results, about_of(labels))
     write_diagnosis_report(folder, results, arrays, labels)
     return folder
 

@@ -8,9 +8,7 @@ import pytest
 from diagnosis_cases import CASES, indistinguishable, none, one_effect, outlier, outside, two_effects
 
 from ccnn_torch.diagnosis.page.data import About, about_of
-from ccnn_torch.diagnosis.page.first_screen import first_screen
-from ccnn_torch.diagnosis.page.numbers import numbers_table
-from ccnn_torch.diagnosis.page.place_words import where_words
+from ccnn_torch.diagnosis.page.first_screen import first_screen, numbers_table, where_words
 from ccnn_torch.diagnosis.verdict.findings import findings, frequency_words, places, size_words
 from ccnn_torch.effects import EFFECTS, OUTLIER
 from ccnn_torch.effects.words import words_of
@@ -138,6 +136,10 @@ def test_what_to_do_now_names_files_columns_and_commands() -> None:
 def test_nothing_bad_rows_and_what_is_outside_are_said() -> None:
     assert _told(none()[0])["What is wrong"].startswith("Nothing: model and machine differ by no more than the noise")
     assert "What it removes" not in _told(none()[0])
+    doubted = none()[0] | {"noise": "estimated"}
+    assert _told(doubted)["What is wrong"] == "Nothing beyond what is taken for noise."
+    doubted["verdict"]["probability"] = 0.4
+    assert _told(doubted)["What is wrong"] == "Nothing that these rows determine."
     bad = _told(outlier()[0])
     assert bad["What is wrong"] == "2 bad rows." and not {"Where", "What it removes"} & set(bad)
     wrong = _told(outside()[0])["What is wrong"]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.checks.cautions import row_cautions
 from ccnn_torch.diagnosis.engine import UNSHOWN, candidates, drawn_rows, usable_rows, why_set_aside
 from ccnn_torch.diagnosis.search.analysis import analyse
+from ccnn_torch.diagnosis.verdict.blocks import span_of
 from ccnn_torch.diagnosis.verdict.text import lacking_text
 from ccnn_torch.effects import Effect, Situation
 
@@ -97,7 +97,7 @@ def check_rows(
 def _confusable(spans: dict[str, Tensor]) -> list[tuple[str, str, float]]:
     """For every ordered pair how much of what the first is likely to do the second can do as well."""
     found = []
-    basis = {n: _span(x) for n, x in spans.items()}
+    basis = {n: span_of(x) for n, x in spans.items()}
     for first, x in spans.items():
         total = x.square().sum()
         if float(total) <= 0:
@@ -107,10 +107,3 @@ def _confusable(spans: dict[str, Tensor]) -> list[tuple[str, str, float]]:
             if share > _ALIKE:
                 found.append((first, second, share))
     return sorted(found, key=lambda f: -f[2])
-
-
-def _span(x: Tensor) -> Tensor:
-    """Orthonormal columns of what x spans."""
-    u, s, _ = torch.linalg.svd(x, full_matrices=False)
-    span: Tensor = u[:, s > 1e-9 * s.max().clamp_min(1e-300)]
-    return span

@@ -60,7 +60,7 @@ def with_network(diagnosis: Diagnosis, seed: int = 0, progress: Progress | None 
         seed: as of the diagnosis.
         progress: called with the share that is done, 0 to 1.
     """
-    return replace(diagnosis, network=remaining_gain(diagnosis.analysis, diagnosis.judgement, seed, progress))
+    return diagnosis.with_entries(network=remaining_gain(diagnosis.analysis, diagnosis.judgement, seed, progress))
 
 
 def remaining_gain(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.diagnosis.verdict.text import words_for
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import read_json
 
@@ -100,10 +101,8 @@ def about_of(labels: Mapping[str, Any]) -> About:
 
 def gaps_of(results: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
     """The gaps that are there, by what they are of; a machine without a position has its rotation under `gap`."""
-    blocks = [block for block in (results["gap"], results.get("gap_rotation")) if block]
-    if results.get("motion"):
-        return [("joint position", block) for block in blocks]
-    return [("rotation" if block["unit"] == "rad" else "position", block) for block in blocks]
+    names = words_for(results).gap
+    return [(names[block["unit"]], block) for block in (results["gap"], results.get("gap_rotation")) if block]
 
 
 def signatures_of(arrays: Mapping[str, Array], labels: Mapping[str, Any], names: Iterable[str] = ()) -> list[Signature]:

@@ -1,15 +1,21 @@
-"""What a technician needs first: what is wrong, how sure that is, what it removes, and what to do now."""
+"""What a technician needs first: what is wrong, where, how sure that is, what it removes, and what to do now."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 from ccnn_torch.diagnosis.page.data import NEXT, About
-from ccnn_torch.diagnosis.page.numbers import numbers_table
-from ccnn_torch.diagnosis.page.place_words import where_words
-from ccnn_torch.diagnosis.page.tables import columns_text
-from ccnn_torch.diagnosis.verdict.findings import findings
+from ccnn_torch.diagnosis.page.tables import columns_text, regime_words, row_parts
+from ccnn_torch.diagnosis.verdict.findings import (
+    clear_parameters,
+    findings,
+    frequency_words,
+    places,
+    repeats_of,
+    size_words,
+)
 from ccnn_torch.diagnosis.verdict.text import (
     capital,
     follows_words,
@@ -19,9 +25,13 @@ from ccnn_torch.diagnosis.verdict.text import (
     probability_words,
     size_text,
     undetermined,
+    words_for,
 )
+from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.effects import OUTLIER
+from ccnn_torch.effects.words import words_of
 from ccnn_torch.report.page import Answer
+from ccnn_torch.report.table import Table
 
 Block = Mapping[str, Any]
 # Numbers of all effects on a screen; a page has room for more.
@@ -57,9 +67,9 @@ def _wrong(results: Block) -> str:
     if verdict["none"]:
         if open_:
             return f"{capital(open_)}; the likeliest: nothing beyond the noise."
-        if results.get("motion") and verdict["probability"] <= 0.5:
-            return "Nothing that these logs determine."
-        if results.get("motion") and in_doubt(results):
+        if verdict["probability"] <= 0.5:
+            return f"Nothing that these {words_for(results).rows} determine."
+        if in_doubt(results):
             return "Nothing beyond what is taken for noise."
         return "Nothing: model and machine differ by no more than the noise."
     if verdict["outside_library"] or not found:
@@ -82,15 +92,13 @@ def _removed(results: Block) -> str:
     verdict, gap, far = results["verdict"], results["gap"], results.get("by_block")
     if not verdict["effects"] or verdict["effects"] == [OUTLIER] or gap["before"] is None or gap["after"] is None:
         return ""
-    rows = "runs not used for fitting" if results.get("motion") else "rows at random"
-    text = f"{size_text(gap['before'], gap)} → {size_text(gap['after'], gap)} on {rows}"
-    if results.get("motion"):
-        pass
-    elif far is not None:
+    words = words_for(results)
+    text = f"{size_text(gap['before'], gap)} → {size_text(gap['after'], gap)} on {words.unseen}"
+    if far is not None:
         before, after = (size_text(far[key], far) for key in ("before", "after"))
         text += f", {before} → {after} where nothing was measured (by block)"
     else:
-        text += "; not known where nothing was measured"
+        text += words.elsewhere
     known = "estimated at" if results.get("noise") == "estimated" else "is"
     floor = f"; the noise {known} {size_text(gap['noise_floor'], gap)}" if gap["noise_floor"] else ""
     network = results.get("network") or {}
@@ -117,3 +125,194 @@ def _measure(results: Block, about: About) -> str:
         each = [f"{columns_text(entry['columns'])} (would show {listed(list(entry['effects']))})" for entry in missing]
         said.append(f"Record as well: {listed(each)}.")
     return " ".join(said)
+
+
+# Joints that are named, and the share from which.
+_MOST_JOINTS, _JOINT = 3, 0.1
+# Share of the gap from which a phase of a motion is named.
+_PHASE = 0.2
+# Times the share of the rows from which a region holds more of the gap than others.
+_MORE = 1.5
+# Of the distances of all regions from the base: a region among the nearest or farthest third is called so, where the
+# distances differ by this share.
+_APART = 0.1
+# Beyond the share of its rows at 95 %: from there on a condition matters.
+_BEYOND = 0.1
+# Ranges below this many metres are told in mm.
+_SMALL = 0.5
+
+
+def where_words(results: Block, about: About) -> list[str]:
+    """Up to three sentences without a full stop; none where there is no gap beside the noise and bad rows.
+
+    Args:
+        results: as in `diagnosis.json`.
+        about: for the units of covariates.
+    """
+    if results["verdict"]["none"] or results["verdict"]["effects"] == [OUTLIER]:
+        return []
+    said = []
+    joints = sorted(results["where"]["joints"].items(), key=lambda item: -item[1])
+    most = [(n, s) for n, s in joints if s >= _JOINT][:_MOST_JOINTS]
+    if len(joints) > 1 and most:
+        shares = listed([f"{places([_joint(name)])} {100 * share:.0f} %" for name, share in most])
+        said.append(f"{shares} of the gap")
+    if phase := _phase(results["where"].get("phases", {})):
+        said.append(phase)
+    if region := _region(results["where"]["regions"]):
+        said.append(region)
+    if regime := _regime(results, about):
+        said.append(regime)
+    return said
+
+
+def _joint(name: str) -> str:
+    return f"joint {name.removeprefix('joint ').removeprefix('q')}"
+
+
+def _phase(phases: Mapping[str, Any]) -> str:
+    """The phase of a motion that holds most of the gap for its time; empty where none stands out."""
+    there = {n: p for n, p in phases.items() if p["share"] >= _PHASE and p["samples"] > 0}
+    if not there:
+        return ""
+    name = max(there, key=lambda n: there[n]["share"] / there[n]["samples"])
+    share, part = there[name]["share"], there[name]["samples"]
+    words = {"standstill": "at standstill", "reversal": "around reversals", "fast": "in fast motion"}
+    text = f"{100 * share:.0f} % of it {words.get(name, 'in slow motion')} ({100 * part:.0f} % of the time)"
+    return text if share > _MORE * part else "spread over all phases of the motion"
+
+
+def _region(regions: list[Block]) -> str:
+    """The region that holds most of the gap, in the robot's frame; empty where the gap is spread evenly."""
+    if not regions:
+        return ""
+    rows = sum(r["rows"] for r in regions)
+    worst = max(regions, key=lambda r: r["share"])
+    part = worst["rows"] / rows
+    if worst["share"] < _MORE * part:
+        return "spread over the whole workspace"
+    names = [n for n in worst["center"] if n in "xyz"]
+    wide = max(worst["half_width"][n] for n in names) if names else 0.0
+    scale, unit, digits = (1e-3, "mm", 0) if wide < _SMALL / 2 else (1.0, "m", 2)
+    ranges = []
+    for n in names:
+        ends = ((worst["center"][n] + side * worst["half_width"][n]) / scale for side in (-1, 1))
+        low, high = (f"{end:.{digits}f}" for end in ends)
+        ranges.append(f"{n} {low} to {high} {unit}")
+    far = _distance(regions, worst, names)
+    text = ", ".join([*ranges, *([far] if far else [])])
+    return f"{100 * worst['share']:.0f} % of it in {100 * part:.0f} % of the rows: {text}" if text else ""
+
+
+def _distance(regions: list[Block], worst: Block, names: list[str]) -> str:
+    """How far from the base a region is among all of them."""
+    away = sorted(math.hypot(*(r["center"][n] for n in names)) for r in regions)
+    own = math.hypot(*(worst["center"][n] for n in names))
+    if len(away) < 3 or away[-1] - away[0] < _APART * away[-1]:
+        return ""
+    third = len(away) // 3
+    return "far from the base" if own >= away[-third] else "near the base" if own <= away[third - 1] else ""
+
+
+def _regime(results: Block, about: About) -> str:
+    """The condition under which the gap is largest, where one stands out."""
+    found = []
+    for name, regimes in results["where"]["covariates"].items():
+        intervals = results.get("where_ci95", {}).get("covariates", {}).get(name) or []
+        for regime, part, interval in zip(regimes, row_parts(regimes), intervals, strict=False):
+            found.append((interval[0] - part, part, regime, name))
+    if not found:
+        return ""
+    beyond, part, regime, name = max(found, key=lambda item: item[0])
+    if beyond < _BEYOND:
+        return ""
+    where = regime_words(name, regime, about.unit(name))
+    return f"{100 * regime['share']:.0f} % of it in {100 * part:.0f} % of the rows: {where}"
+
+
+_Z95 = 1.96
+# Of the middle from which a gain counts: a gain of some thousandths times the rest is no error.
+_MIDDLE_DIGITS = 6
+# Numbers of an effect, however many effects there are.
+_FEWEST = 2
+# A wave of forty periods over the travel, ten travels from where the joint counts from, is in step to a thousandth.
+_PERIOD_DIGITS = 7
+_OWN_UNIT = "A number without unit has that of the simulator."
+
+
+def numbers_table(results: Block, most: int) -> Table | None:
+    """The largest numbers with their 95 % intervals; of parameters of the model also what to enter in their place.
+
+    Args:
+        results: as in `diagnosis.json`.
+        most: about so many are shown, of each effect those that are largest against their standard deviations.
+    """
+    rows, notes, left_out = [], [], 0
+    by_name, chosen = {e["name"]: e for e in results["effects"]}, results["verdict"]["effects"]
+    each = max(most // max(len(chosen), 1), _FEWEST)
+    for effect in chosen:
+        parameters = by_name.get(effect, {}).get("parameters", {})
+        clear = clear_parameters(parameters)
+        for name in list(clear)[:each]:
+            block = parameters[name]
+            value, unit, error = block["value"], block["unit"], _Z95 * block["sd"]
+            part = block.get("part") or ""
+            enter = "–" if block.get("nominal") is None else _whole(block["nominal"] + value, unit, block["sd"])
+            text = f"{_named(name, part)}{_often(name, parameters)}{_counted(block)}"
+            text = text if len(chosen) == 1 else f"{words_of(effect).short}, {text}"
+            rows.append((text, size_words(value, unit, 4), f"± {size_words(error, unit, 2, value)}", enter))
+        left_out += max(len(clear) - each, 0)
+        notes += [_OWN_UNIT] if any(not block["unit"] for block in clear.values()) else []
+        notes += [words_of(effect).meaning] if clear and words_of(effect).meaning else []
+    if not rows:
+        return None
+    columns: tuple[str, ...] = ("number", "error found", "95 %", "enter instead")
+    cells: list[tuple[str, ...]] = [*rows]
+    if all(row[3] == "–" for row in rows):
+        columns, cells = columns[:3], [row[:3] for row in rows]
+    if left_out:
+        notes.append(f"{left_out} more that are clearly not 0 are in diagnosis.json.")
+    notes.append("The intervals hold if nothing else acts and the rest of the model is right.")
+    return Table("Numbers to enter", columns, cells, " ".join(notes))
+
+
+def _named(name: str, part: str) -> str:
+    """A number as results call it, after the joint, leg or link that it belongs to."""
+    own = name.removeprefix(f"q{part.partition(' ')[2]} ") if part else name
+    return part if own in (part, f"q{part.partition(' ')[2]}") else f"{part} {own}".strip()
+
+
+def _often(name: str, parameters: Block) -> str:
+    """How often a wave of a periodic error repeats; empty for other numbers."""
+    joint, *rest = name.split(" ")
+    own = repeats_of(parameters, joint)
+    if own is None or not rest:
+        return ""
+    times = int(rest[1]) if len(rest) > 1 and rest[1].isdigit() else 1
+    return f", {frequency_words(times * own['value'], own['unit'], _PERIOD_DIGITS)}"
+
+
+def _counted(block: Block) -> str:
+    """From where a gain counts, and which way a number does, where that is not the usual one."""
+    if "sense" in block:
+        return f", {block['sense']}"
+    if "about" not in block:
+        return ""
+    about = block["about"]
+    scale, unit = (1e-3, "mm") if about["unit"] == "m" else (1.0, unit_text(about["unit"]))
+    return f", about {about['joint']} = {number_text(about['value'] / scale, _MIDDLE_DIGITS)} {unit}"
+
+
+def _whole(value: float, unit: str, sd: float) -> str:
+    """A number to enter, to the digits that are known: lengths in mm, angles in rad and degrees."""
+    if unit == "m":
+        scale, shown = display_unit("m", 1.0)
+        return f"{value / scale:.{_decimals(sd / scale)}f} {shown}"
+    text = f"{value:.{_decimals(sd)}f} {unit_text(unit)}".removesuffix(" 1").strip()
+    degrees = math.degrees(1.0)
+    return f"{text} = {value * degrees:.{_decimals(sd * degrees)}f}°" if unit == "rad" else text
+
+
+def _decimals(sd: float) -> int:
+    """Decimals down to a tenth of a standard deviation."""
+    return min(max(1 - math.floor(math.log10(sd)), 0), 12) if sd > 0 else 6

@@ -1,8 +1,9 @@
-"""From `diagnosis.json` and its arrays to everything that is read: terminal, Markdown, pictures, one HTML page."""
+"""From `diagnosis.json` and its arrays to terminal, Markdown, pictures and one HTML page; and that of `ccnn check`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
 
+from ccnn_torch.diagnosis.checks.identifiable import Check
 from ccnn_torch.diagnosis.page.data import (
     ARRAYS,
     CORRECTED,
@@ -23,18 +25,21 @@ from ccnn_torch.diagnosis.page.data import (
     signatures_of,
     used_rows,
 )
-from ccnn_torch.diagnosis.page.first_screen import ON_SCREEN, first_screen
-from ccnn_torch.diagnosis.page.localisation import aside_table, next_table, region_table, where_table, write_next_csv
+from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, ON_SCREEN, first_screen
 from ccnn_torch.diagnosis.page.tables import (
+    aside_table,
     confusable_table,
     effect_table,
     gap_table,
+    next_table,
     order_table,
     parameter_table,
     record_table,
+    region_table,
     unseen_table,
+    where_table,
 )
-from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, unseen_text, verdict_text
+from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, size_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.arrays import load_tensors, save_tensors
@@ -59,7 +64,7 @@ def write_diagnosis_report(
     arrays: Mapping[str, Tensor] | None = None,
     labels: Block | None = None,
 ) -> Path:
-    """Write `report.html`, `diagnosis.md`, `next_measurements.csv` and `plots/`.
+    """Write `report.html`, `diagnosis.md` and `plots/`.
 
     The same files give the same report, so it can be written again at any time. A picture or a table whose numbers are
     not there is left out.
@@ -87,8 +92,6 @@ def write_diagnosis_report(
         write_json(folder / LABELS, labels or {})
     numbers, labels = load_tensors(folder / ARRAYS)[0], load_labels(folder)
     about = about_of(labels)
-    if not results.get("motion"):
-        write_next_csv(folder / NEXT, results, about)
     # Here, so that `ccnn check` and the verdict on the terminal do not wait for matplotlib.
     from ccnn_torch.report.figures.style import inline_figures
 
@@ -102,20 +105,31 @@ def diagnosis_page(
     about: About | None = None,
     arrays: Arrays | None = None,
     figures: Sequence[InlineFigure] = (),
+    screen: bool = False,
 ) -> Page:
-    """All that a diagnosis shows in files."""
+    """All that a diagnosis shows.
+
+    Args:
+        results: as in `diagnosis.json`.
+        about: for names, units and paths.
+        arrays: as `write_diagnosis_report` takes them.
+        figures: of the page.
+        screen: for a terminal: fewer rows, the rows set aside in a sentence, and without the verdict, which is shown
+            before all else.
+    """
     about, arrays = about or About(), arrays or {}
     named = {figure.name: figure for figure in figures}
     machine = [named["machine"]] if "machine" in named else []
+    answers = first_screen(results, about, ON_SCREEN if screen else ON_PAGE)
+    aside = results["rows_set_aside"]
+    why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
     return Page(
         name=about.name,
         kind="diagnosis of the gap",
-        verdict=verdict_text(results),
-        sections=[
-            Section(figures=machine, answers=first_screen(results, about)),
-            *_sections(results, arrays, about, named),
-        ],
+        verdict="" if screen else verdict_text(results),
+        sections=[Section(figures=machine, answers=answers), *_sections(results, arrays, about, named, screen)],
         facts=_facts(results, arrays, about),
+        cautions=[*filter(None, [aside_text(aside, why, about.lines)])] if screen else [],
         notes=_notes(results, about),
     )
 
@@ -132,19 +146,15 @@ def print_diagnosis(
         verdict: begin with the verdict; False where it was shown before.
         details: show the tables as well.
     """
-    about = about or About()
     if verdict:
         print_text(verdict_text(results), console, "bold")
-    Section(answers=first_screen(results, about, ON_SCREEN)).show(console)
+    page = diagnosis_page(results, about, screen=True)
     if details:
-        _print_tables(results, console, about)
-    aside = results["rows_set_aside"]
-    why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
-    sentence = aside_text(aside, why, about.lines)
-    Section(sentences=[*filter(None, [sentence]), *_notes(results, about)]).show(console)
-    if not details:
-        said = "All tables are in report.html, diagnosis.md and diagnosis.json; --details shows them here."
-        print_text(said, console, "dim")
+        page.show(console)
+        return
+    replace(page, sections=page.sections[:1]).show(console)
+    said = "All tables are in report.html, diagnosis.md and diagnosis.json; --details shows them here."
+    print_text(said, console, "dim")
 
 
 def _notes(results: Block, about: About) -> list[str]:
@@ -154,28 +164,9 @@ def _notes(results: Block, about: About) -> list[str]:
     return [note if note.endswith(".") else f"{note}." for note in notes]
 
 
-def _print_tables(results: Block, console: Console, about: About) -> None:
-    shown = (
-        gap_table(results, about),
-        effect_table(results, least=_LEAST),
-        order_table(results),
-        parameter_table(results, 12),
-        where_table(results, about, telling=True),
-        next_table(results, about),
-        unseen_table(results),
-        record_table(results),
-    )
-    Section(tables=[table for table in shown if table is not None]).show(console)
-    if order_table(results) is None and (text := network_text(results)):
-        print_text(text, console)
-
-
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
-    from ccnn_torch.diagnosis.page.figure_course import course_plot
-    from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
-    from ccnn_torch.diagnosis.page.figure_machine import machine_plot
-    from ccnn_torch.diagnosis.page.figure_signature import signature_plot
-    from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
+    from ccnn_torch.diagnosis.page.figure_rows import machine_plot, signature_plot
+    from ccnn_torch.diagnosis.page.figures import course_plot, gap_plot, probability_plot, remainder_map, where_plot
 
     effects = list(results["verdict"]["effects"])
     plots = (
@@ -190,17 +181,19 @@ def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[
     return [plot for plot in plots if plot is not None]
 
 
-def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str, InlineFigure]) -> list[Section]:
+def _sections(
+    results: Block, arrays: Arrays, about: About, figures: Mapping[str, InlineFigure], screen: bool
+) -> list[Section]:
     """The page in reading order; a section with nothing to show is left out."""
+    order = order_table(results)
+    effects = effect_table(results, least=_LEAST if screen else 0.0)
+    parameters = parameter_table(results, 12 if screen else 24)
+    where = where_table(results, about, telling=screen)
     planned: list[tuple[str, tuple[str, ...], tuple[Table | None, ...]]] = [
-        ("How large is the gap?", ("gap",), (gap_table(results, about), order_table(results))),
-        ("Which effect?", ("probabilities",), (effect_table(results), parameter_table(results))),
+        ("How large is the gap?", ("gap",), (gap_table(results, about), order)),
+        ("Which effect?", ("probabilities",), (effects, parameters)),
         ("What gives it away?", ("signatures",), ()),
-        (
-            "Where is the gap?",
-            ("map", "where", "course"),
-            (where_table(results, about), region_table(results, about)),
-        ),
+        ("Where is the gap?", ("map", "where", "course"), (where, region_table(results, about))),
         ("Which effects do these rows not distinguish?", (), (confusable_table(results),)),
         ("What can these records not show?", (), (unseen_table(results), record_table(results))),
         ("What should be measured next?", (), (next_table(results, about),)),
@@ -212,6 +205,9 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
         there = [table for table in tables if table is not None]
         if shown or there:
             sections.append(Section(title, there, shown))
+    if order is None:
+        # No table has what a network would gain.
+        sections[0] = replace(sections[0], sentences=[*filter(None, [network_text(results)])])
     return sections
 
 
@@ -227,3 +223,41 @@ def _facts(results: Block, arrays: Arrays, about: About) -> str:
     if results["rows_set_aside"]:
         facts.append(f"{len(results['rows_set_aside'])} set aside")
     return " · ".join(facts)
+
+
+# Confusable effects shown for each effect.
+_LIKEST = 3
+
+
+def check_text(check: Check) -> list[str]:
+    """What the records can and cannot show, one sentence a line."""
+    units = {name: {"unit": "rad" if name.startswith("r") else "m"} for name in check.noise}
+    noise = ", ".join(f"{name} {size_text(size, units[name], 2)}" for name, size in check.noise.items())
+    lines = [
+        f"{check.rows} rows, {len(check.aside)} of them set aside; Jacobian's condition number up to "
+        f"{check.condition:.3g}.",
+        f"Noise, {'as given' if check.noise_given else 'estimated'}: {noise}.",
+        f"Covariates: {', '.join(check.covariates) or 'none'}.",
+    ]
+    lines += [aside_text(check.aside, check.why_aside, check.lines_aside)] if check.aside else []
+    lines += [f"{remark}." for remark in check.remarks]
+    lines += [f"Caution: {caution}." for caution in check.cautions]
+    lines += [f"{name} cannot be seen without {why}." for name, why in check.missing.items()]
+    lines += [f"{name} could hide: its plausible size is {size:.2g} of the noise." for name, size in check.weak.items()]
+    return lines
+
+
+def check_table(check: Check) -> Table:
+    """What could take over each effect on these rows, the closest first."""
+    found: dict[str, list[str]] = {}
+    for first, second, share in check.confusable:
+        found.setdefault(first, []).append(f"{second} {share:.3f}")
+    rows = tuple(
+        (name, ", ".join(others[:_LIKEST]) + (f" and {more} more" if (more := len(others) - _LIKEST) > 0 else ""))
+        for name, others in found.items()
+    )
+    note = (
+        "Cosine between what an effect is likely to do and what another can do. A diagnosis still distinguishes them "
+        "where the other one needs implausible or more coefficients; all pairs are in check.json (--out)."
+    )
+    return Table("Confusable", ("effect", "taken over by"), rows, note, ("taken over by",))

@@ -1,16 +1,19 @@
-"""The blocks of a diagnosis from an analysis and its judgement."""
+"""The blocks of a diagnosis from an analysis and its judgement; why rows do not distinguish two effects."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE
+from ccnn_torch.diagnosis.result import effect_block, gap_block
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
-from ccnn_torch.diagnosis.verdict.separability import signature_angles
 from ccnn_torch.effects import Coefficient
 from ccnn_torch.evidence.dictionary import covariance
 from ccnn_torch.evidence.shrink import Gap, HeldOut, draws, shrink_of
@@ -54,19 +57,21 @@ class Blocks:
 def blocks(made: Blocks) -> tuple[dict[str, Any], dict[str, Any] | None, list[dict[str, Any]]]:
     """`gap`, `gap_rotation`, `effects` of diagnosis.json."""
     position, rotation = bool(made.position.any()), bool((~made.position).any())
-    gap = _gap(made.main(made.together), "m" if position else "rad")
-    turned = _gap(made.gap(made.together, False), "rad") if rotation and position else None
-    return gap, turned, [_effect(made, name) for name in _ordered(made)]
-
-
-def in_order(made: Blocks) -> list[dict[str, Any]]:
-    """`in_order` of diagnosis.json: the verdict's effects added one after the other, each step refitted."""
-    found = []
-    for name, held in zip(made.judgement.names, made.steps, strict=True):
-        gap = made.main(held)
-        interval = None if gap.interval is None else list(gap.interval)
-        found.append({"name": name, "gap_after": gap.after, "shrink": gap.shrink, "shrink_ci95": interval})
-    return found
+    gap = gap_block(made.main(made.together), "m" if position else "rad")
+    turned = gap_block(made.gap(made.together, False), "rad") if rotation and position else None
+    judged = made.judgement
+    effects = [
+        effect_block(
+            name,
+            judged.marginal.get(name, 0.0),
+            _parameters(made, name),
+            made.main(made.alone[name]),
+            judged.classes.get(name, ()),
+            made.apart.get(name, {}),
+        )
+        for name in _ordered(made)
+    ]
+    return gap, turned, effects
 
 
 def noise_floor(analysis: Analysis) -> Tensor:
@@ -84,32 +89,6 @@ def noise_floor(analysis: Analysis) -> Tensor:
     # No more than the richest fit leaves.
     share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)
     return (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * share
-
-
-def _gap(gap: Gap, unit: str) -> dict[str, Any]:
-    share = max(0.0, 1 - (gap.floor / gap.before) ** 2) if gap.before > 0 else 0.0
-    return {
-        "unit": unit,
-        "before": gap.before,
-        "after": gap.after,
-        "noise_floor": gap.floor,
-        "reducible_share": share,
-    }
-
-
-def _effect(made: Blocks, name: str) -> dict[str, Any]:
-    alone = made.main(made.alone[name])
-    return {
-        "name": name,
-        "probability": made.judgement.marginal.get(name, 0.0),
-        "parameters": _parameters(made, name),
-        "gap_before": alone.before,
-        "gap_after": alone.after,
-        "shrink": alone.shrink,
-        "shrink_ci95": None if alone.interval is None else list(alone.interval),
-        "indistinguishable_from": list(made.judgement.classes.get(name, ())),
-        "signatures": made.apart.get(name, {}),
-    }
 
 
 def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
@@ -175,3 +154,61 @@ def _ordered(made: Blocks) -> list[str]:
     marginal = made.judgement.marginal
     tie = {n: made.alone[n].left.square().sum() for n in made.alone}
     return sorted(made.alone, key=lambda n: (-marginal.get(n, 0.0), float(tie[n]), n))
+
+
+_RANK = 1e-9
+
+
+def signature_angles(analysis: Analysis, judgement: Judgement) -> dict[str, dict[str, dict[str, float]]]:
+    """Of each of the verdict's effects how far its signature is from those that may replace it.
+
+    A signature is the fitted part of an effect in units of the noise, the verdict's other effects projected out. The
+    angle is the principal one between it and all that the other effect can do (Björck and Golub 1973): 0 where the
+    other can do the very same. What no fit of the other can copy is the sine of the angle times the size of the
+    signature, the root of a sum of squares over all rows: below about 3 noise hides it, at any angle.
+
+    Returns:
+        `{effect: {other: {"angle" [rad], "separation" [1, times the noise]}}}`.
+    """
+    atoms = analysis.atoms
+    found = judgement.found
+    flat = analysis.dictionary.columns.flatten(0, 1)
+
+    def columns(members: Sequence[int]) -> Tensor:
+        return torch.cat([flat[:, :0], *(flat[:, analysis.dictionary.groups[i]] for i in members)], -1)
+
+    block: dict[str, dict[str, dict[str, float]]] = {}
+    for i, mean in zip(found.members, found.mean, strict=True):
+        like = judgement.classes.get(atoms[i].name, ())
+        if not like:
+            continue
+        beside = span_of(columns([j for j in found.members if j != i]))
+        own = _without(beside, columns([i]) @ mean[:, None])[:, 0]
+        size = float(torch.linalg.vector_norm(own))
+        block[atoms[i].name] = {}
+        for name in like:
+            # Where a name has several atoms (shapes), the closest one.
+            spans = [span_of(_without(beside, columns([j]))) for j, a in enumerate(atoms) if a.name == name]
+            angle = min(_angle(own, span) for span in spans)
+            block[atoms[i].name][name] = {"angle": angle, "separation": size * math.sin(angle)}
+    return block
+
+
+def span_of(x: Tensor) -> Tensor:
+    """Orthonormal columns of what the columns of x span, `N x r`."""
+    if not x.shape[-1]:
+        return x
+    u, s, _ = torch.linalg.svd(x, full_matrices=False)
+    span: Tensor = u[:, s > _RANK * s.max().clamp_min(1e-300)]
+    return span
+
+
+def _without(span: Tensor, x: Tensor) -> Tensor:
+    return x - span @ (span.mT @ x)
+
+
+def _angle(line: Tensor, span: Tensor) -> float:
+    """Between a vector and a subspace, by its sine: the arc cosine is blind to small angles."""
+    outside = torch.linalg.vector_norm(_without(span, line[:, None]))
+    inside = torch.linalg.vector_norm(span.mT @ line)
+    return float(torch.atan2(outside, inside))

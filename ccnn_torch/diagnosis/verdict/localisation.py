@@ -77,31 +77,22 @@ def localise(analysis: Analysis, residual: Tensor, seed: int = 0) -> tuple[dict[
         name: _bins(value[keep]) for name, value in situation.covariates.items() if float(value.max() - value.min()) > 0
     }
     covariates = {name: drawn.shares(_split(rows, member)) for name, (_, member) in edges.items()}
-    block = {
-        "outputs": dict(zip(axes, outputs.plain, strict=True)),
-        "joints": dict(zip(names, joints.plain, strict=True)),
-        "legs": dict(zip(legs, joints.plain, strict=False)),
-        "regions": [
-            {**place, "share": share, "rows": int(n)}
-            for place, share, n in zip(places, regions.plain, inside.sum(0), strict=True)
-        ],
-        "covariates": {
-            name: [
-                {"from": low, "to": high, "share": share, "rows": int(rows_there)}
-                for (low, high), share, rows_there in zip(
-                    edges[name][0], found.plain, edges[name][1].sum(0), strict=True
-                )
-            ]
-            for name, found in covariates.items()
-        },
+    parts = {"outputs": (axes, outputs), "joints": (names, joints), "legs": (legs, joints)}
+    # A machine without legs has no names for them.
+    block: dict[str, Any] = {g: dict(zip(n, own.plain, strict=False)) for g, (n, own) in parts.items()}
+    intervals: dict[str, Any] = {g: dict(zip(n, own.interval, strict=False)) for g, (n, own) in parts.items()}
+    block["regions"] = [
+        {**place, "share": share, "rows": int(n)}
+        for place, share, n in zip(places, regions.plain, inside.sum(0), strict=True)
+    ]
+    block["covariates"] = {
+        name: [
+            {"from": low, "to": high, "share": share, "rows": int(n)}
+            for (low, high), share, n in zip(edges[name][0], own.plain, edges[name][1].sum(0), strict=True)
+        ]
+        for name, own in covariates.items()
     }
-    intervals = {
-        "outputs": dict(zip(axes, outputs.interval, strict=True)),
-        "joints": dict(zip(names, joints.interval, strict=True)),
-        "legs": dict(zip(legs, joints.interval, strict=False)),
-        "regions": regions.interval,
-        "covariates": {name: found.interval for name, found in covariates.items()},
-    }
+    intervals |= {"regions": regions.interval, "covariates": {n: own.interval for n, own in covariates.items()}}
     return block, intervals
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,34 @@ _DRIVERS = {
     "position": "the position of the joint",
     "torque": "the torque of the motor",
 }
+
+
+class Words(NamedTuple):
+    """What is said otherwise of poses than of a motion.
+
+    Attributes:
+        rows, place: what a verdict rests on, and what is measured of each.
+        gap: what a gap is of, by its unit.
+        unseen: on what it was judged.
+        elsewhere: what is said where nothing is known of rows far from all others.
+    """
+
+    rows: str
+    place: str
+    gap: Mapping[str, str]
+    unseen: str
+    elsewhere: str
+
+
+_OF_POSES = Words(
+    "rows", "pose", {"m": "position", "rad": "rotation"}, "rows at random", "; not known where nothing was measured"
+)
+_OF_A_MOTION = Words("logs", "position", dict.fromkeys(("m", "rad"), "joint position"), "runs not used for fitting", "")
+
+
+def words_for(results: Block) -> Words:
+    """The words of a diagnosis of poses, or of a motion."""
+    return _OF_A_MOTION if results.get("motion") else _OF_POSES
 
 
 def effect_words(name: str) -> str:
@@ -104,8 +132,8 @@ def in_doubt(results: Block) -> bool:
 
 def undetermined(results: Block) -> str:
     """That the rows do not determine the verdict, without a full stop; empty where they do."""
-    rows = "logs" if results.get("motion") else "rows"
-    return f"the {rows} do not determine the cause" if results["verdict"]["probability"] < _OPEN else ""
+    open_ = results["verdict"]["probability"] < _OPEN
+    return f"the {words_for(results).rows} do not determine the cause" if open_ else ""
 
 
 def verdict_text(results: Block) -> str:
@@ -297,10 +325,10 @@ def _blocks(results: Block) -> list[Block]:
     return [b for b in (results["gap"], results.get("gap_rotation")) if b and b["before"]]
 
 
-def size_text(value: float, block: Block) -> str:
+def size_text(value: float, block: Block, digits: int = 3) -> str:
     """A size in the unit of a block of `diagnosis.json`, in the prefix that fits."""
     scale, unit = display_unit(block["unit"], value)
-    return f"{number_text(value / scale, 3)} {unit}"
+    return f"{number_text(value / scale, digits)} {unit}"
 
 
 def _times(ratio: float) -> str:

@@ -1,41 +1,38 @@
-"""The effects of motion by name."""
+"""The effects of motion by name, and those of a simulator's own parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ccnn_torch.effects.constant import PARAMETER
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.effects.backlash import BACKLASH
-from ccnn_torch.motion.effects.cogging import COGGING
-from ccnn_torch.motion.effects.coulomb import COULOMB
-from ccnn_torch.motion.effects.delay import DELAY
-from ccnn_torch.motion.effects.flexible_joint import FLEXIBLE_JOINT
-from ccnn_torch.motion.effects.gravity import GRAVITY
-from ccnn_torch.motion.effects.inertia import INERTIA
-from ccnn_torch.motion.effects.integral_action import INTEGRAL_ACTION
-from ccnn_torch.motion.effects.offset import OFFSET
-from ccnn_torch.motion.effects.payload import PAYLOAD
-from ccnn_torch.motion.effects.protocol import MotionEffect
-from ccnn_torch.motion.effects.saturation import SATURATION
-from ccnn_torch.motion.effects.servo_gain import SERVO_GAIN
-from ccnn_torch.motion.effects.speed_limit import SPEED_LIMIT
-from ccnn_torch.motion.effects.stribeck import STRIBECK
-from ccnn_torch.motion.effects.supply import SUPPLY
-from ccnn_torch.motion.effects.thermal_friction import THERMAL_FRICTION
-from ccnn_torch.motion.effects.viscous import VISCOUS
+from ccnn_torch.motion.effects import bodies, control, friction, gears
+from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 from ccnn_torch.plugins import is_plugin, load_plugin
 from ccnn_torch.spelling import nearest
 
 EFFECTS: dict[str, MotionEffect] = {
     effect.name: effect
     for effect in (
-        *(DELAY, SERVO_GAIN, OFFSET, GRAVITY, PAYLOAD, INERTIA, VISCOUS, COULOMB, STRIBECK, BACKLASH),
-        *(FLEXIBLE_JOINT, SPEED_LIMIT, SATURATION, SUPPLY, COGGING, THERMAL_FRICTION, INTEGRAL_ACTION),
+        *(control.DELAY, control.SERVO_GAIN, control.OFFSET, bodies.GRAVITY, bodies.PAYLOAD, bodies.INERTIA),
+        *(friction.VISCOUS, friction.COULOMB, friction.STRIBECK, gears.BACKLASH, gears.FLEXIBLE_JOINT),
+        *(control.SPEED_LIMIT, control.SATURATION, control.SUPPLY, gears.COGGING, friction.THERMAL_FRICTION),
+        control.INTEGRAL_ACTION,
     )
 }
 
 EXACT = frozenset({"delay", "servo_gain", "offset", "gravity", "payload", "inertia"})
 """Effects whose form is that of rigid bodies and of the control loop; friction, play and limits differ from theirs."""
+
+OWN = "own "
+"""What the names of a simulator's own parameters begin with among those of an axis."""
+
+
+def own_parameter(key: str, value: float) -> MotionEffect:
+    """What the simulator gives at another value of one of its parameters, to first order."""
+    # Half of it is a plausible error; of one that is 0 nothing is known.
+    number = Number(key, "", 0.5 * abs(value) or 1.0, (add(f"{OWN}{key}"),), 0.0, model=value)
+    return MotionEffect(f"{PARAMETER}{key}", lambda axis: (number,))
 
 
 def motion_effects(names: Sequence[str] | None = None) -> list[MotionEffect]:

@@ -1,4 +1,4 @@
-"""Covariates that were not recorded: the effects that they would make visible, and their plausible size."""
+"""What was not recorded: covariates and the effects that they would show, and directions from the order of the rows."""
 
 from __future__ import annotations
 
@@ -14,9 +14,13 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import default_shape, scaled_signature
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.search.shared_noise import without_fitted
+from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Effect, Situation, pose_residual
+from ccnn_torch.effects.backlash import Backlash
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
 from ccnn_torch.errors import InputError
+from ccnn_torch.evidence.dictionary import gain_beside
 
 # Speeds are not among them: rows at rest, as most are, have none.
 _KINDS = ("time", "temperature", "load", "direction")
@@ -94,3 +98,60 @@ def _usual(change: Tensor, position: bool) -> float:
     """Size of a change of the usual row, given as `s x c` or by parts, `s x c x m` [m] or [rad]."""
     block = torch.nan_to_num(change[:, :3] if position else change[:, 3:])
     return float(block.square().flatten(1).sum(1).median().sqrt())
+
+
+# Log odds that the directions must gain beside the verdict, and beyond twice what those of as many random orders gain:
+# in any order a row far out was reached from further in, so that directions follow the place a little.
+_CLEARLY, _ORDERS = 10.0, 4
+_EFFECT = Backlash()
+
+
+def directions_of_order(situation: Situation) -> dict[str, Tensor]:
+    """Sign of each joint's way from the row before, `s` each, by the names of their columns; {} where one is recorded.
+
+    Rows are in the order of their time where that was recorded, else in that of the file. A joint that stands still
+    keeps its sign; before its first motion it is 0.
+
+    Args:
+        situation: all rows of the file.
+    """
+    time = situation.covariates.get("time")
+    order = torch.arange(len(situation.joints)) if time is None else time.argsort(stable=True)
+    return {} if situation.directed else _by_name(_signs(situation.joints, order))
+
+
+def order_shows(analysis: Analysis, judgement: Judgement, directions: Mapping[str, Tensor]) -> bool:
+    """Whether what a verdict leaves follows these directions.
+
+    Args:
+        analysis: of the rows.
+        judgement: the verdict without them.
+        directions: of the same rows, `s` each; {} = none.
+    """
+    if not directions:
+        return False
+    white, keep = analysis.whitening, analysis.whitening.keep()
+    frames, target = (analysis.correlation(white(v)[keep]) for v in (analysis.fitted, analysis.residual[..., None]))
+    drawn = torch.Generator().manual_seed(0)
+    orders = [torch.randperm(len(analysis.residual), generator=drawn) for _ in range(_ORDERS)]
+    groups = []
+    for signs in (directions, *(_by_name(_signs(analysis.situation.joints, order)) for order in orders)):
+        there = replace(analysis.situation, covariates={**analysis.situation.covariates, **signs})
+        columns = scaled_signature(there, _EFFECT, default_shape(there, _EFFECT))
+        groups.append(without_fitted(frames, [target, analysis.correlation(white(columns)[keep])])[1])
+    gain, *by_chance = gain_beside(analysis.dictionary, judgement.found, groups, analysis.y)
+    return gain > _CLEARLY + 2 * max(0.0, *by_chance)
+
+
+def _signs(joints: Tensor, order: Tensor) -> Tensor:
+    """Sign of each joint's way from the row before in an order of the rows, `s x n`."""
+    way = joints[order].diff(dim=0, prepend=joints[order[:1]]).sign()
+    rows = torch.arange(len(way))[:, None].expand_as(way)
+    last = torch.where(way != 0, rows, 0).cummax(0).values
+    signs = torch.empty_like(joints)
+    signs[order] = way.gather(0, last)
+    return signs
+
+
+def _by_name(signs: Tensor) -> dict[str, Tensor]:
+    return {f"direction{i + 1}": way for i, way in enumerate(signs.unbind(-1))}

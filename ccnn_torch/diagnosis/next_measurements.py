@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -17,6 +16,7 @@ from ccnn_torch.effects import Situation
 from ccnn_torch.evidence.dictionary import FittedSet, covariance
 from ccnn_torch.evidence.sets import scored
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.numerics.designs import Candidates
 
 _CANDIDATES = 400
 _WANTED = 8
@@ -32,19 +32,25 @@ _APART = 1.1
 
 
 class _Question(NamedTuple):
-    """What a row may answer: coefficients `m` with covariance `m x m`, whose columns are `x` `s x c x m`, whitened.
+    """What a row may answer.
 
-    Between two explanations the coefficients are those of both, the second's with a minus in the columns: `x @ mean` is
-    how far their predictions differ. `weight` is how much the answer is wanted, `names` the names that it
-    distinguishes.
+    Between two explanations the coefficients are those of both, the second's with a minus in the columns.
+
+    Attributes:
+        candidates: the rows, for the coefficients, and how far the predictions differ between two explanations.
+        weight: how much the answer is wanted.
+        names: the names that it distinguishes.
     """
 
-    x: Tensor
-    mean: Tensor
-    covariance: Tensor
+    candidates: Candidates
     weight: float
     names: list[str]
-    gain: Callable[[Tensor, Tensor], Tensor]
+
+    @property
+    def gain(self) -> Tensor:
+        """What each candidate says, `s` [nat]."""
+        there = self.candidates
+        return 0.5 * (there.information() if there.difference is None else there.divergence())
 
 
 def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> list[dict[str, Any]]:
@@ -67,12 +73,12 @@ def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> li
         joint = torch.block_diag(own, covariance(analysis.dictionary, other))  # type: ignore[no-untyped-call]
         names = sorted(_names(analysis, first) ^ _names(analysis, other))
         mean = torch.cat([*first.mean, *other.mean])
-        questions.append(_Question(both, mean, joint, weight / rivals[1][0], names, _divergence))
+        questions.append(_Question(Candidates.of(both, joint, mean), weight / rivals[1][0], names))
     wanted = _chosen(situation, questions) if questions else []
     if wanted or not first.members:
         return wanted
     # No row distinguishes them, so the numbers are made sharper.
-    return _chosen(situation, [_Question(x, torch.cat(first.mean), own, 1.0, [], _information)])
+    return _chosen(situation, [_Question(Candidates.of(x, own), 1.0, [])])
 
 
 def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, FittedSet]]:
@@ -170,35 +176,25 @@ def _signatures(analysis: Analysis, found: FittedSet, situation: Situation) -> T
     return torch.cat(columns, -1)
 
 
-def _divergence(difference: Tensor, open_: Tensor) -> Tensor:
-    """Half the square of a difference `s x c` in units of noise and what is open, `s x c x c`."""
-    gain: Tensor = 0.5 * (difference * torch.linalg.solve(open_, difference)).sum(-1)
-    return gain
-
-
-def _information(difference: Tensor, open_: Tensor) -> Tensor:
-    """Half the log determinant of noise and what is open in units of the noise, `s`."""
-    gain: Tensor = 0.5 * torch.linalg.slogdet(open_).logabsdet
-    return gain
-
-
 def _chosen(situation: Situation, questions: list[_Question]) -> list[dict[str, Any]]:
     """The rows that say most together, by what each says alone."""
     mechanism = situation.mechanism
     possible = _possible(situation)
+    weights = torch.tensor([[q.weight] for q in questions], dtype=torch.float64)
     alone: Tensor | None = None
     taken: list[tuple[int, int]] = []
     for _ in range(_WANTED):
-        gains = torch.stack([_gains(q) for q in questions])
+        gains = torch.stack([q.gain for q in questions])
         alone = gains if alone is None else alone
-        worth = torch.where(possible & (gains >= _TELLING), torch.nan_to_num(gains * _weights(questions)), 0.0)
+        worth = torch.where(possible & (gains >= _TELLING), torch.nan_to_num(gains * weights), 0.0)
         best = int(worth.max(0).values.argmax())
         if not float(worth[:, best].max()) > 0:
             break
         taken.append((best, int(worth[:, best].argmax())))
         possible = possible.clone()
         possible[best] = False
-        questions = [_measured(q, best) for q in questions]
+        for question in questions:
+            question.candidates.change(best, 1)
     assert alone is not None
     taken.sort(key=lambda pair: -float(alone[pair[1], pair[0]]))
     return [
@@ -212,30 +208,9 @@ def _chosen(situation: Situation, questions: list[_Question]) -> list[dict[str, 
     ]
 
 
-def _weights(questions: list[_Question]) -> Tensor:
-    """How much each answer is wanted, `q x 1`."""
-    return torch.tensor([[q.weight] for q in questions], dtype=torch.float64)
-
-
 def _possible(situation: Situation) -> Tensor:
     """Candidates that the machine reaches and where first order holds, `s`."""
     whole = torch.isfinite(situation.jacobian).flatten(1).all(-1) & torch.isfinite(situation.joints).all(-1)
     reach = torch.linalg.matrix_norm(torch.nan_to_num(situation.jacobian), ord=2)
     possible: Tensor = whole & (reach < _GAIN * reach[whole].median())
     return possible
-
-
-def _gains(question: _Question) -> Tensor:
-    """What each candidate says, `s`."""
-    noise = torch.eye(question.x.shape[1], dtype=question.x.dtype)
-    return question.gain(question.x @ question.mean, noise + question.x @ question.covariance @ question.x.mT)
-
-
-def _measured(question: _Question, row: int) -> _Question:
-    """What remains to be distinguished once a candidate is measured: a Kalman step towards no difference."""
-    x, covariance = question.x[row], question.covariance
-    open_ = torch.eye(len(x), dtype=x.dtype) + x @ covariance @ x.mT
-    step = torch.linalg.solve(open_, x @ covariance).mT
-    return question._replace(
-        mean=question.mean - step @ (x @ question.mean), covariance=covariance - step @ x @ covariance
-    )

@@ -1,4 +1,4 @@
-"""A mass that the model lacks or has wrong, at the tool or at the end of an axis' lever: its weight and inertia."""
+"""Effects of masses that the model lacks or has wrong: weight, inertia, payload."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LEAST = 0.01
 _TINY = 1e-12
 
 
-def _missing(axis: Facts) -> str:
+def _unloaded(axis: Facts) -> str:
     if axis.carried is not None:
         return "" if 100 * axis.carried >= _LEAST * axis.error else "a joint that the mass loads"
     if axis.unit != "rad":
@@ -21,7 +21,7 @@ def _missing(axis: Facts) -> str:
     return "" if axis.length and axis.gain else "the axis' gain and the lever of its load (keys gain and length)"
 
 
-def _numbers(axis: Facts) -> tuple[Number, ...]:
+def _mass(axis: Facts) -> tuple[Number, ...]:
     if axis.carried is not None:
         # A mass that would explain the error.
         return (Number("mass", "kg", axis.error / max(axis.carried, _TINY), (add(CARRIED),), most=axis.heaviest),)
@@ -36,4 +36,24 @@ def _numbers(axis: Facts) -> tuple[Number, ...]:
     return (Number("mass", "kg", 0.1 * gain / (STANDARD_GRAVITY * lever), acts),)
 
 
-PAYLOAD = MotionEffect("payload", _numbers, missing=_missing)
+# Sag of an axis that turns against its own weight. Sine and cosine of the joint's angle, since the direction of the
+# weight is not known; of a sliding axis a constant, which is an offset.
+GRAVITY = MotionEffect(
+    "gravity",
+    lambda axis: (
+        Number("torque at 90 degrees", "torque", 0.1, (add("gravity_sin"),), 0.2),
+        Number("torque at 0 degrees", "torque", 0.1, (add("gravity_cos"),), 0.0),
+    ),
+    missing=lambda axis: (
+        "" if axis.unit == "rad" else "a turning joint (the weight on a sliding one looks like an offset)"
+    ),
+)
+
+# A mass at the tool or at the end of an axis' lever.
+PAYLOAD = MotionEffect("payload", _mass, missing=_unloaded)
+
+# Armature, gears, load that turns: of an axis whose inertia is known half of it; else that of an axis of 3 Hz.
+INERTIA = MotionEffect(
+    "inertia",
+    lambda axis: (Number("inertia", "inertia", 0.5 * axis.nominal.get("inertia", 0.0) or 0.003, (add("inertia"),)),),
+)
