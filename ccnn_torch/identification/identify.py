@@ -1,4 +1,4 @@
-"""From rows to the identified parameters of every method, and their figures."""
+"""From rows to the identified parameters of every method, their figures, and the folder with all of it."""
 
 from __future__ import annotations
 
@@ -16,31 +16,33 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Fit, Progress
 from ccnn_torch.identification.config import IdentifyConfig, base_method
-from ccnn_torch.identification.constrained.identify import identify_by_constraint
-from ccnn_torch.identification.identifiability.bootstrap import bootstrap
-from ccnn_torch.identification.judge import map_error
-from ccnn_torch.identification.measured.measured import Measured
-from ccnn_torch.identification.measured.nominal import nominal_machine
-from ccnn_torch.identification.measured.records import from_records
+from ccnn_torch.identification.constrained import identify_by_constraint
+from ccnn_torch.identification.identifiability import bootstrap
+from ccnn_torch.identification.judge import map_error, read_elsewhere, transferred
+from ccnn_torch.identification.measured import Measured, from_records, nominal_machine
+from ccnn_torch.identification.page import identified_page, write_identified_csv, write_identified_report
 from ccnn_torch.identification.result import assemble, beside_truth, judged, promised, residuals_of
-from ccnn_torch.identification.simulated.counts import count_study
-from ccnn_torch.identification.simulated.machines import simulate
+from ccnn_torch.identification.simulated import count_study, simulate
 from ccnn_torch.identification.solve import (
     QUICK,
     Outcome,
     frames_first,
     free_values,
     is_apart,
+    load_outcome,
     pieces_of,
     run_method,
+    save_outcome,
     select,
     solver_of,
 )
-from ccnn_torch.identification.store import load_outcome, save_outcome
-from ccnn_torch.identification.transfer import read_elsewhere, transferred
 from ccnn_torch.mechanisms import Framed, Mechanism
+from ccnn_torch.mechanisms.files.write_arm import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
+from ccnn_torch.report.arrays import ARRAYS_FILE, save_tensors
+from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.results.identified import IdentifiedResults
 from ccnn_torch.run_folder.resume import check_fingerprint, fingerprint
 
 Watch = Callable[[str], Progress]
@@ -72,8 +74,6 @@ class Identification:
 
     def save(self, folder: str | Path) -> None:
         """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`."""
-        from ccnn_torch.identification.outputs import write_outputs
-
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         config = self.config
@@ -201,3 +201,20 @@ def _fingerprint(measured: Measured) -> str:
     for table in (measured.start, *(t for r in rows for t in (r.joints, r.observed))):
         digest.update(table.contiguous().numpy().tobytes())
     return digest.hexdigest()
+
+
+RESULTS = "identified.json"
+
+
+def write_outputs(found: Identification, folder: Path) -> None:
+    """Write everything; `identified.json` comes last: a folder that has it is finished."""
+    results = found.results
+    write_identified_csv(folder / "identified.csv", results)
+    write_whole(folder / "identified.md", identified_page(results).markdown())
+    save_tensors(folder / ARRAYS_FILE, found.arrays)
+    # Of several machines the first.
+    config = found.config
+    write_machine(found.mechanism(), found.nominal(), folder, "identified", config.columns, config.joint_map)
+    if found.config.save_report:
+        write_identified_report(folder, results)
+    write_json(folder / RESULTS, IdentifiedResults.model_validate(results))

@@ -5,9 +5,8 @@ from __future__ import annotations
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.identify import identify
-from ccnn_torch.identification.outputs import RESULTS, write_outputs
-from ccnn_torch.identification.page.tables import identified_page, not_settled
+from ccnn_torch.identification.identify import RESULTS, identify, write_outputs
+from ccnn_torch.identification.page import identified_page, not_settled
 from ccnn_torch.report.screen import note, progress_bar, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, resume_hint
 from ccnn_torch.run_folder.resume import FolderJob

@@ -12,10 +12,17 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.doubts import doubts_of
-from ccnn_torch.identification.judge import commanded, map_error, noise_of_test, predicted
-from ccnn_torch.identification.measured.measured import Measured
-from ccnn_torch.identification.pose_errors import before_and_after, figures, removed
+from ccnn_torch.identification.judge import (
+    before_and_after,
+    commanded,
+    doubts_of,
+    figures,
+    map_error,
+    noise_of_test,
+    predicted,
+    removed,
+)
+from ccnn_torch.identification.measured import Measured
 from ccnn_torch.identification.problems.parameters import Selection
 from ccnn_torch.identification.solve import (
     Outcome,
@@ -159,7 +166,7 @@ def assemble(
         "noise_ratio": figures({"value": known.noise}),
         "doubts": doubts,
         "counts": [],
-        "paper": config.paper,
+        "paper": None,
         "data_sha256": measured.data_hash or None,
         "notes": [*measured.notes, *messages, *notes],
         "versions": {

@@ -1,10 +1,13 @@
-"""One method on the rows of an identification, jointly or leg by leg, on all machines at once."""
+"""One method on the rows of an identification, jointly or leg by leg, on all machines at once; its checkpoint."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,11 +27,12 @@ from ccnn_torch.identification import (
     what_is_known,
 )
 from ccnn_torch.identification.config import PER_LEG, IdentifyConfig, base_method
-from ccnn_torch.identification.measured.measured import Measured, Rows
+from ccnn_torch.identification.measured import Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.problem import part_of
 from ccnn_torch.identification.solvers.registry import get_solver
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
+from ccnn_torch.training import load_checkpoint, save_checkpoint
 
 QUICK = ("lm", "tikhonov")
 """The others are global searches, which take minutes where these take a blink."""
@@ -225,3 +229,32 @@ def knowledge_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> li
         what_is_known(piece.problem, free[:, [names.index(p.name) for p in piece.problem.parameters]])
         for piece in pieces
     ]
+
+
+def save_outcome(path: Path, outcome: Outcome, facts: Mapping[str, Any]) -> None:
+    """Write an outcome; `facts` say what config and data it is of.
+
+    Raises:
+        WriteError: it cannot be written.
+    """
+    about = {
+        "facts": dict(facts),
+        "evaluations": outcome.evaluations,
+        "seconds": outcome.seconds,
+        "message": outcome.message,
+    }
+    tensors = {"machines": outcome.machines, "values": outcome.values, "converged": outcome.converged}
+    save_checkpoint(path, tensors, about)
+
+
+def load_outcome(path: Path) -> Outcome:
+    """The outcome in a file."""
+    tensors, about = load_checkpoint(path)
+    return Outcome(
+        tensors["machines"],
+        tensors["values"],
+        tensors["converged"].to(torch.bool),
+        int(about["evaluations"]),
+        float(about["seconds"]),
+        str(about["message"]),
+    )

@@ -8,7 +8,7 @@ from linkages import NOISE, measured
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import ParameterChoice, inverse_problem, solve_lm, what_is_known
-from ccnn_torch.identification.identifiability.bootstrap import bootstrap
+from ccnn_torch.identification.identifiability import bootstrap
 
 
 @pytest.mark.parametrize("redraw", ["residuals", "rows"])

@@ -18,7 +18,7 @@ from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.parameters import ParameterChoice, Selection, select_parameters
 from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations
-from ccnn_torch.identification.problems.rows import check_finite
+from ccnn_torch.identification.problems.whitened import check_finite
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 

@@ -1,0 +1,316 @@
+"""What the rows determine: standard errors, correlations, hidden directions in words, and a bootstrap over rows."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.linalg import qr
+from scipy.sparse.csgraph import connected_components
+from scipy.special import ndtri, stdtrit
+from torch import Tensor
+
+from ccnn_torch.coordinates import Parameter
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification.problems.problem import OPEN, Fit, Problem, Solver, WeightedRows
+
+# Component of a hidden direction below which a parameter does not take part. Real geometry is never exactly parallel:
+# smaller components come from the errors themselves and would tie everything to everything.
+TAKES_PART = 1e-2
+
+
+def combinations_in_words(parameters: Sequence[Parameter], hidden: Tensor, scale: Tensor) -> tuple[str, ...]:
+    """A sentence for each group of parameters that hidden directions tie together.
+
+    `A1x and l1 only as 1.00 A1x - 0.72 l1`: of errors of the two, in SI, the rows see this combination and no other.
+
+    Args:
+        hidden: directions that the rows do not see, orthonormal or zero, one a row, `… x k`, in units of `scale`.
+        scale: `k` [SI].
+    """
+    rows = hidden.detach().cpu().numpy()
+    projector = rows.T @ rows
+    part = np.diag(projector) > TAKES_PART**2
+    count, group = connected_components((np.abs(projector) > TAKES_PART) & part & part[:, None], directed=False)
+    sizes = scale.cpu().numpy()
+    sentences = []
+    for number in range(count):
+        members = np.flatnonzero((group == number) & part).tolist()
+        if len(members):
+            visible = _visible(projector[np.ix_(members, members)]) / sizes[members]
+            sentences.append(_sentence([parameters[i].name for i in members], visible))
+    return tuple(sentences)
+
+
+def _visible(projector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Combinations that the rows see, the complement of a group's hidden directions, each with a parameter of its own:
+    reduced echelon form, `visible x members`."""
+    values, vectors = np.linalg.eigh(projector)
+    basis = vectors[:, values < 0.5].T
+    if not len(basis):
+        return basis
+    own = np.sort(qr(basis, mode="economic", pivoting=True)[2][: len(basis)])
+    reduced: NDArray[np.float64] = np.linalg.solve(basis[:, own], basis)
+    return np.where(np.abs(reduced) < TAKES_PART, 0.0, reduced)
+
+
+def _sentence(names: list[str], visible: NDArray[np.float64]) -> str:
+    everyone = _listed(names)
+    if not len(visible):
+        return f"{everyone} not at all"
+    return f"{everyone} only as {_listed([_combination(names, row) for row in visible])}"
+
+
+def _combination(names: list[str], row: NDArray[np.float64]) -> str:
+    """With 1.00 before its first parameter."""
+    taking = np.flatnonzero(row)
+    row = row / row[taking[0]]
+    text = f"{_number(row[taking[0]])} {names[taking[0]]}"
+    for i in taking[1:]:
+        text += f" {'-' if row[i] < 0 else '+'} {_number(abs(row[i]))} {names[i]}"
+    return text
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if 0.1 <= value < 1000 else f"{value:.3g}"
+
+
+def _listed(texts: list[str]) -> str:
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
+
+
+# Singular values below this share of the largest are rounding.
+_RANK = 1e-9
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Of `r` machines and `k` parameters.
+
+    Attributes:
+        parameters: the free ones.
+        sd: standard errors, `r x k` [SI], priors included; inf where the rows (and priors) leave a parameter open.
+        correlation: of the estimates, `r x k x k` [1]; NaN in the rows and columns of parameters left open.
+        identifiable: `r x k`, bool: whether the rows alone determine the parameter, without the priors.
+        singular_values: of the Jacobian with residuals in their unit and parameters in plausible errors, falling,
+            without priors, `r x k` [1].
+        directions: its right singular vectors, one a row, `r x k x k`, in plausible errors; those from `rank` on
+            cannot be known.
+        rank: `r`.
+        combinations: sentences that say what of the parameters left open is known, of the machine of least rank; empty
+            where every parameter is identifiable.
+        noise: standard deviation of the residuals that the fit leaves, `r`, in their unit: about 1 where the noise was
+            given rightly; inf where no equation is to spare.
+        freedom: equations less parameters that they determine, `r` [1].
+        noise_known: whether the standard errors use the noise given (1) or that of the fit.
+    """
+
+    parameters: tuple[Parameter, ...]
+    sd: Tensor
+    correlation: Tensor
+    identifiable: Tensor
+    singular_values: Tensor
+    directions: Tensor
+    rank: Tensor
+    combinations: tuple[str, ...]
+    noise: Tensor
+    freedom: Tensor
+    noise_known: bool
+
+    def half_width(self, level: float = 0.95) -> Tensor:
+        """Half the interval that holds the truth with this probability, `r x k` [SI]; by Student's t where the noise
+        is that of the fit."""
+        tail = (1 + level) / 2
+        if self.noise_known:
+            return self.sd * float(ndtri(tail))
+        factor = stdtrit(self.freedom.clamp_min(1e-9).cpu().numpy(), tail)
+        return self.sd * torch.as_tensor(factor, dtype=self.sd.dtype, device=self.sd.device)[:, None]
+
+
+def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
+    """Standard errors and identifiability at some values, from the linearised problem (Gauss-Markov, Cramér-Rao).
+
+    At the true values with the true noise the standard errors are the Cramér-Rao bound. No pseudoinverse: along a
+    direction that the rows do not see the uncertainty is infinite, and so is that of every parameter that takes part
+    in it. A direction whose standard error would be above 100 plausible errors counts as not seen.
+    A parameter takes part in a direction if one plausible error along it moves the parameter by more than a hundredth
+    of its own; one that is moved by less keeps a finite error, with that movement in it.
+
+    Args:
+        problem: for a robust fit, that of `robust.reweighted`; its standard deviations are then approximate; see
+        `bootstrap`.
+        values: `r x k` or `k` [SI].
+
+    Raises:
+        InputError: the residual is not finite at these values.
+    """
+    rows = WeightedRows(problem)
+    values = values.expand_as(problem.start)
+    residual, slope = rows.linearised(values)
+    k = values.shape[-1]
+    pull = torch.diag(rows.pull.sqrt()).expand(len(values), k, k)
+    _, strength, basis = torch.linalg.svd(_tall(torch.cat([slope, pull], dim=-2)), full_matrices=False)
+    freedom, noise = _noise(residual, slope, rows.equations, strength, basis)
+    unit = torch.ones_like(noise) if problem.noise_known else noise
+    # Without redundant equations the noise is unknown: only rounding then decides what is unobservable.
+    least = torch.where(torch.isfinite(unit), unit / OPEN, 0.0)[:, None]
+
+    _, singular, directions = torch.linalg.svd(_tall(slope), full_matrices=False)
+    seen = singular > torch.maximum(_RANK * singular[:, :1], least)
+    hidden = torch.where(seen[..., None], 0.0, directions)
+    identifiable = hidden.square().sum(-2) <= TAKES_PART**2
+    open_ = strength <= torch.maximum(_RANK * strength[:, :1], least)
+    dragged = torch.where(open_[..., None], basis, 0.0).square().sum(-2)
+    left_open = dragged > TAKES_PART**2
+    spread = torch.where(open_, 0.0, 1 / strength.clamp_min(1e-300))[..., None] * basis
+    covariance = spread.mT @ spread
+    root = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    correlation = covariance / (root[..., None] * root[..., None, :]).clamp_min(1e-300)
+    either = left_open[..., None] | left_open[..., None, :]
+    worst = int(seen.sum(-1).argmin())
+    return Knowledge(
+        parameters=problem.parameters,
+        sd=torch.where(left_open, torch.inf, ((unit[:, None] * root).square() + dragged).sqrt() * problem.scale),
+        correlation=torch.where(either, torch.nan, correlation.clamp(-1, 1)),
+        identifiable=identifiable,
+        singular_values=singular,
+        directions=directions,
+        rank=seen.sum(-1),
+        combinations=combinations_in_words(problem.parameters, hidden[worst], problem.scale),
+        noise=noise,
+        freedom=freedom,
+        noise_known=problem.noise_known,
+    )
+
+
+def _noise(
+    residual: Tensor, slope: Tensor, equations: Tensor, strength: Tensor, basis: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Equations to spare and the standard deviation of the residual, `r` each; strength and basis with the priors."""
+    inverse = torch.where(strength > _RANK * strength[:, :1], 1 / strength.clamp_min(1e-300), 0.0)
+    determined = (slope @ (inverse[..., None] * basis).mT).square().sum((-2, -1))
+    # Whole numbers without priors; a remainder of rounding is no equation to spare.
+    freedom = equations - determined
+    freedom = torch.where(freedom > 1e-6, freedom, 0.0)
+    noise = torch.where(freedom > 0, (residual.square().sum(-1) / freedom.clamp_min(1e-6)).sqrt(), torch.inf)
+    return freedom, noise
+
+
+def require_identifiable(knowledge: Knowledge) -> None:
+    """For what needs every parameter.
+
+    Raises:
+        InputError: the identification matrix is singular; the sentence names the parameters that are determined.
+    """
+    if knowledge.combinations:
+        k = len(knowledge.parameters)
+        raise InputError(
+            f"the identification matrix is singular (rank {int(knowledge.rank.min())} of {k}): "
+            f"{'; '.join(knowledge.combinations)}; fix or tie parameters, give a prior, or measure other poses"
+        )
+
+
+def _tall(matrix: Tensor) -> Tensor:
+    """With rows of zeros until there are as many as columns, so that every direction gets a singular value."""
+    missing = matrix.shape[-1] - matrix.shape[-2]
+    if missing <= 0:
+        return matrix
+    return torch.cat([matrix, matrix.new_zeros(*matrix.shape[:-2], missing, matrix.shape[-1])], dim=-2)
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """Fits to redrawn rows.
+
+    Attributes:
+        values: `count x r x k` [SI].
+        converged: `count x r`, bool.
+    """
+
+    values: Tensor
+    converged: Tensor
+
+    def sd(self) -> Tensor:
+        """Standard deviation over the draws, `r x k` [SI]."""
+        return self.values.std(0)
+
+    def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
+        """Percentiles over the draws that hold the share `level`, low and high, `r x k` each [SI]."""
+        tails = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=self.values.dtype, device=self.values.device)
+        low, high = torch.quantile(self.values, tails, dim=0)
+        return low, high
+
+
+def bootstrap(
+    problem: Problem, fit: Fit, solver: Solver, count: int = 200, seed: int = 0, redraw: str = "residuals"
+) -> Bootstrap:
+    """Solve the problem again with redrawn rows, all draws as machines side by side in one call of the solver.
+
+    Args:
+        problem: as it was solved.
+        fit: what the solver found; searches begin there.
+        solver: the one to try.
+        count: draws.
+        seed: of the draws; the solver gets it too.
+        redraw: `residuals`: the residual rows that the fit leaves are drawn with replacement and put to the fitted
+            ones (Efron 1979), raised by sqrt(N / (N - k)) for the parameters fitted; it keeps the poses. `rows`: the
+            rows get random weights of mean 1 (the Bayesian bootstrap, Rubin 1981, which unlike drawing rows never
+            leaves too few of them); it also holds where the noise differs between rows.
+
+    Raises:
+        InputError: another `redraw`, or fewer than two draws.
+    """
+    if redraw not in ("residuals", "rows") or count < 2:
+        raise InputError(f"redraw is 'residuals' or 'rows', with at least 2 draws; got '{redraw}', {count}")
+    generator = torch.Generator().manual_seed(seed)
+    r, s = problem.weights.shape
+    device = problem.start.device
+    uniform = torch.rand(count, r, s, generator=generator, dtype=torch.float64).to(device)
+
+    def repeated(table: Tensor) -> Tensor:
+        """`count * r x …` from `r x …`; what all machines share stays one."""
+        return table if len(table) == 1 else table.repeat(count, *[1] * (table.dim() - 1))
+
+    data = tuple(repeated(d) for d in problem.data)
+    if redraw == "rows":
+        used = problem.weights > 0
+        drawn = torch.where(used, -torch.log(uniform.clamp_min(1e-300)), 0.0)
+        weights = problem.weights * drawn * used.sum(-1, keepdim=True) / drawn.sum(-1, keepdim=True)
+        again = dataclasses.replace(problem, weights=weights.flatten(0, 1), data=data)
+    else:
+        again = dataclasses.replace(
+            problem,
+            weights=problem.weights.repeat(count, 1),
+            data=(*data, _redrawn(problem, fit.values, uniform)),
+            residual=lambda values, *rows: problem.residual(values, *rows[:-1]) + rows[-1],
+        )
+    # The prior pulls to where it pulled before.
+    start = problem.start if bool(torch.isfinite(problem.prior_sd).any()) else fit.values
+    again = dataclasses.replace(again, start=start.repeat(count, 1))
+    found = solver(again, seed)
+    return Bootstrap(found.values.reshape(count, r, -1), found.converged.reshape(count, r))
+
+
+def _redrawn(problem: Problem, values: Tensor, uniform: Tensor) -> Tensor:
+    """What to add to the residual so that at `values` it is one drawn from those left there: `count * r x s x c`."""
+    rows = WeightedRows(dataclasses.replace(problem, weights=(problem.weights > 0).to(values)))
+    everyone = torch.arange(len(values), device=values.device)
+    kept = (problem.weights > 0).any(0)
+    left = values.new_zeros(*problem.weights.shape, len(problem.channels))
+    left[:, kept] = rows.residuals(values[:, None], everyone)[:, 0]
+    root = problem.weights.sqrt()[..., None]
+    equations = (problem.weights > 0).sum(-1) * len(problem.channels)
+    raised = (equations / (equations - values.shape[-1]).clamp_min(1)).sqrt()[:, None, None]
+    pool = left * root
+    pool = (pool - pool.sum(-2, keepdim=True) / (root > 0).sum(-2, keepdim=True)) * raised
+    # The n-th used row of a machine, n drawn uniformly.
+    order = torch.argsort((problem.weights == 0).to(torch.int8), dim=-1, stable=True)
+    number = (uniform * (problem.weights > 0).sum(-1)[:, None]).long()
+    chosen = torch.take_along_dim(order.expand_as(number), number, dim=-1)
+    drawn = torch.take_along_dim(pool.expand(*number.shape, -1), chosen[..., None], dim=-2)
+    offset = torch.where(root > 0, drawn / root.clamp_min(1e-300), 0.0) - left
+    return offset.flatten(0, 1)
