@@ -245,10 +245,11 @@ class Bootstrap:
         return low, high
 
 
-def bootstrap(
-    problem: Problem, fit: Fit, solver: Solver, count: int = 200, seed: int = 0, redraw: str = "residuals"
-) -> Bootstrap:
+def bootstrap(problem: Problem, fit: Fit, solver: Solver, count: int = 200, seed: int = 0) -> Bootstrap:
     """Solve the problem again with redrawn rows, all draws as machines side by side in one call of the solver.
+
+    The residual rows that the fit leaves are drawn with replacement and put to the fitted ones (Efron 1979), raised by
+    sqrt(N / (N - k)) for the parameters fitted; it keeps the poses.
 
     Args:
         problem: as it was solved.
@@ -256,16 +257,12 @@ def bootstrap(
         solver: the one to try.
         count: draws.
         seed: of the draws; the solver gets it too.
-        redraw: `residuals`: the residual rows that the fit leaves are drawn with replacement and put to the fitted
-            ones (Efron 1979), raised by sqrt(N / (N - k)) for the parameters fitted; it keeps the poses. `rows`: the
-            rows get random weights of mean 1 (the Bayesian bootstrap, Rubin 1981, which unlike drawing rows never
-            leaves too few of them); it also holds where the noise differs between rows.
 
     Raises:
-        InputError: another `redraw`, or fewer than two draws.
+        InputError: fewer than two draws.
     """
-    if redraw not in ("residuals", "rows") or count < 2:
-        raise InputError(f"redraw is 'residuals' or 'rows', with at least 2 draws; got '{redraw}', {count}")
+    if count < 2:
+        raise InputError(f"a bootstrap has at least 2 draws; got {count}")
     generator = torch.Generator().manual_seed(seed)
     r, s = problem.weights.shape
     device = problem.start.device
@@ -275,22 +272,15 @@ def bootstrap(
         """`count * r x …` from `r x …`; what all machines share stays one."""
         return table if len(table) == 1 else table.repeat(count, *[1] * (table.dim() - 1))
 
-    data = tuple(repeated(d) for d in problem.data)
-    if redraw == "rows":
-        used = problem.weights > 0
-        drawn = torch.where(used, -torch.log(uniform.clamp_min(1e-300)), 0.0)
-        weights = problem.weights * drawn * used.sum(-1, keepdim=True) / drawn.sum(-1, keepdim=True)
-        again = dataclasses.replace(problem, weights=weights.flatten(0, 1), data=data)
-    else:
-        again = dataclasses.replace(
-            problem,
-            weights=problem.weights.repeat(count, 1),
-            data=(*data, _redrawn(problem, fit.values, uniform)),
-            residual=lambda values, *rows: problem.residual(values, *rows[:-1]) + rows[-1],
-        )
     # The prior pulls to where it pulled before.
     start = problem.start if bool(torch.isfinite(problem.prior_sd).any()) else fit.values
-    again = dataclasses.replace(again, start=start.repeat(count, 1))
+    again = dataclasses.replace(
+        problem,
+        start=start.repeat(count, 1),
+        weights=problem.weights.repeat(count, 1),
+        data=(*(repeated(d) for d in problem.data), _redrawn(problem, fit.values, uniform)),
+        residual=lambda values, *rows: problem.residual(values, *rows[:-1]) + rows[-1],
+    )
     found = solver(again, seed)
     return Bootstrap(found.values.reshape(count, r, -1), found.converged.reshape(count, r))
 

@@ -37,7 +37,7 @@ from ccnn_torch.identification.solve import (
     solver_of,
 )
 from ccnn_torch.mechanisms import Framed, Mechanism
-from ccnn_torch.mechanisms.files.write_arm import write_machine
+from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
 from ccnn_torch.report.arrays import ARRAYS_FILE, save_tensors

@@ -11,21 +11,18 @@ from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.refinement import (
+    RefinementSettings,
+    RefinementState,
     finish_refinement,
+    part_of_problem,
     pose_refinement,
     second_order,
     start_refinement,
     step_refinement,
 )
-from ccnn_torch.evolution.refinement_state import (
-    RefinementSettings,
-    RefinementState,
-    part_of_problem,
-)
 from ccnn_torch.evolution.settings import check_least
-from ccnn_torch.learners.one_network import OneNetwork
 from ccnn_torch.learners.protocol import TrainingData
-from ccnn_torch.learners.rows import mean_square, usable_rows
+from ccnn_torch.learners.rows import OneNetwork, mean_square, usable_rows
 from ccnn_torch.numerics.trees import picked, put
 
 _STARTS = 0

@@ -8,16 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.bundle import averaged, without_waves
-from ccnn_torch.evolution.coevolution import REPRESENTATIVES, density, diversity
-from ccnn_torch.evolution.evaluation import EPSILON, make_task
-from ccnn_torch.evolution.harmonics import Harmonics, fit_harmonics, harmonic_count
-from ccnn_torch.evolution.masked_network import MaskedNetwork
-from ccnn_torch.evolution.network import forward
+from ccnn_torch.evolution.coevolution import EPSILON, REPRESENTATIVES, density, diversity, make_task
+from ccnn_torch.evolution.masked_network import MaskedNetwork, Spread, readout_spread, spread_variance
+from ccnn_torch.evolution.network import averaged, forward, without_waves
 from ccnn_torch.evolution.random import member_seeds
 from ccnn_torch.evolution.settings import CCNNSettings
-from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
-from ccnn_torch.evolution.waves import Waves
+from ccnn_torch.evolution.waves import Harmonics, Waves, fit_harmonics, harmonic_count
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import thinned
 from ccnn_torch.learners.structure import MemberRows, Structure

@@ -7,21 +7,20 @@ import itertools
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.breeding import (
+from ccnn_torch.evolution.coevolution import EPSILON, density, diversity, fitness, make_task, network_errors
+from ccnn_torch.evolution.genome import (
     BreedingDraws,
+    Genome,
     breed_networks,
     breeding_shapes,
     initial_population,
+    select,
     with_elites,
 )
-from ccnn_torch.evolution.coevolution import density, diversity
-from ccnn_torch.evolution.evaluation import EPSILON, fitness, make_task, network_errors
-from ccnn_torch.evolution.genome import Genome, select
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import ENNSettings
-from ccnn_torch.learners.one_network import OneNetwork
 from ccnn_torch.learners.protocol import TrainingData
-from ccnn_torch.learners.rows import mean_square, usable_rows
+from ccnn_torch.learners.rows import OneNetwork, mean_square, usable_rows
 from ccnn_torch.numerics.trees import chosen, mapped
 
 # Streams of random numbers: one for the generations, one for each layer's first individuals.

@@ -8,14 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.bundle import Bundle, averaged, resized, without_waves
-from ccnn_torch.evolution.coevolution import Coevolution, advance, keep_refined, start
-from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
+from ccnn_torch.evolution.coevolution import Coevolution, Task, advance, fitness, joined_errors, keep_refined, start
+from ccnn_torch.evolution.gauss_newton import prior_groups, resized_prior
 from ccnn_torch.evolution.genome import Genome
-from ccnn_torch.evolution.network import forward
-from ccnn_torch.evolution.priors import prior_groups, resized_prior
-from ccnn_torch.evolution.refinement import refine
-from ccnn_torch.evolution.refinement_state import Precisions, RefinementSettings
+from ccnn_torch.evolution.network import Bundle, averaged, forward, resized, without_waves
+from ccnn_torch.evolution.refinement import Precisions, RefinementSettings, refine
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves
 from ccnn_torch.numerics.blocks import blocks

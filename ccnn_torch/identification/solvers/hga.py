@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.evolution.operators import tournament
+from ccnn_torch.evolution.genome import tournament
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress, WeightedRows
 
