@@ -12,7 +12,7 @@ The subpopulations take turns within a generation: each is renewed and judged be
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
@@ -32,7 +32,7 @@ from ccnn_torch.evolution.genome import (
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.numerics.blocks import block_size
-from ccnn_torch.numerics.trees import chosen, joined
+from ccnn_torch.numerics.trees import chosen, joined, mapped, picked
 
 # Input of an unfed node: sigmoid(-1e4) is exactly 0, and unlike -inf it never makes a NaN.
 _FORCED_OFF = -1e4
@@ -109,31 +109,13 @@ def joined_errors(
     Returns:
         `r x p x k` [1].
     """
-    repeats, individuals = population.mask.shape[:2]
     sets = representatives[0].mask.shape[1]
-    widest = max(genome.mask.shape[-2] for genome in representatives)
-    each = max(1, sets * widest * task.inputs.shape[-1])
-    block = block or _block(population.weight.device)
-    columns = min(individuals, max(1, block // each))
-    rows = max(1, block // (each * columns))
-    if rows >= repeats and columns >= individuals:
-        return _errors(layer, population, representatives, task)
-    parts = []
-    for start in range(0, repeats, rows):
-        here = slice(start, start + rows)
-        fixed = [Genome(g.mask[here], g.weight[here]) for g in representatives]
-        rows_task = Task(*(part[here] for part in task))
-        pieces = [
-            _errors(
-                layer,
-                Genome(population.mask[here, c : c + columns], population.weight[here, c : c + columns]),
-                fixed,
-                rows_task,
-            )
-            for c in range(0, individuals, columns)
-        ]
-        parts.append(torch.cat(pieces, dim=1))
-    return torch.cat(parts)
+
+    def judged(here: slice, some: slice) -> Tensor:
+        own = mapped(lambda value: value[here, some], population)
+        return _errors(layer, own, picked(list(representatives), here), picked(task, here))
+
+    return _in_blocks(judged, population, sets * _widest(representatives), task, block)
 
 
 def network_errors(networks: Sequence[Genome], task: Task, block: int | None = None) -> Tensor:
@@ -146,31 +128,34 @@ def network_errors(networks: Sequence[Genome], task: Task, block: int | None = N
     Returns:
         `r x p` [1].
     """
-    repeats, count = networks[0].mask.shape[:2]
-    each = max(genome.mask.shape[-2] for genome in networks) * task.inputs.shape[-1]
-    block = block or _block(task.inputs.device)
-    columns = min(count, max(1, block // each))
+
+    def judged(here: slice, some: slice) -> Tensor:
+        own = mapped(lambda value: value[here, some], list(networks))
+        return _errors(None, None, own, picked(task, here))[:, 0]
+
+    return _in_blocks(judged, networks[0], _widest(networks), task, block)
+
+
+def _widest(layers: Sequence[Genome]) -> int:
+    return max(genome.mask.shape[-2] for genome in layers)
+
+
+def _in_blocks(
+    judged: Callable[[slice, slice], Tensor], population: Genome, width: int, task: Task, block: int | None
+) -> Tensor:
+    """`judged` of some repeats and individuals at a time, `r x p x ...`; width: activations each and row."""
+    repeats, individuals = population.mask.shape[:2]
+    each = max(1, width * task.inputs.shape[-1])
+    # What suits the device, and the budget of memory holds (in, out, and the masks').
+    suits = _BLOCK.get(task.inputs.device.type, _BLOCK_ELSEWHERE)
+    block = block or block_size(_COPIES * 8, _COPIES * 8 * suits)
+    columns = min(individuals, max(1, block // each))
     rows = max(1, block // (each * columns))
-    parts = []
-    for start in range(0, repeats, rows):
-        here = slice(start, start + rows)
-        rows_task = Task(*(part[here] for part in task))
-        pieces = [
-            _errors(
-                None,
-                None,
-                [Genome(g.mask[here, c : c + columns], g.weight[here, c : c + columns]) for g in networks],
-                rows_task,
-            )
-            for c in range(0, count, columns)
-        ]
-        parts.append(torch.cat(pieces, dim=-1))
-    return torch.cat(parts)[:, 0]
-
-
-def _block(device: torch.device) -> int:
-    """Activations at a time: what suits the device, and the budget of memory holds (in, out, and the masks')."""
-    return block_size(_COPIES * 8, _COPIES * 8 * _BLOCK.get(device.type, _BLOCK_ELSEWHERE))
+    parts = [
+        torch.cat([judged(slice(r, r + rows), slice(c, c + columns)) for c in range(0, individuals, columns)], 1)
+        for r in range(0, repeats, rows)
+    ]
+    return torch.cat(parts)
 
 
 def _errors(layer: int | None, population: Genome | None, representatives: Sequence[Genome], task: Task) -> Tensor:

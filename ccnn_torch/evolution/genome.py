@@ -14,7 +14,7 @@ networks.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -38,6 +38,17 @@ class Genome(NamedTuple):
 
     mask: Tensor
     weight: Tensor
+
+
+def named_genomes(prefix: str, layers: Iterable[Genome]) -> dict[str, Tensor]:
+    """All tensors by name, as `PREFIXmask_0`."""
+    return {f"{prefix}{name}_{n}": value for n, layer in enumerate(layers) for name, value in layer._asdict().items()}
+
+
+def genomes_of(named: dict[str, Tensor]) -> list[Genome]:
+    """Inverse of `named_genomes` without a prefix; what else is there is left aside."""
+    layers = range(sum(name.startswith("mask_") for name in named))
+    return [Genome(named[f"mask_{layer}"], named[f"weight_{layer}"]) for layer in layers]
 
 
 def active(genome: Genome) -> Tensor:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.evolution.genome import kept
-from ccnn_torch.evolution.network import alive_nodes, forward, hidden_signal, prune
+from ccnn_torch.evolution.network import alive_nodes, forward, hidden_signal, prune, with_slots
 from ccnn_torch.evolution.waves import Harmonics, Waves
 
 _SMALLEST_NOISE = 1e-12
@@ -335,11 +335,7 @@ def _used_slots(mask: Tensor, slots: int) -> Tensor:
 
 def _kept_columns(values: Tensor, hidden: int, used: Tensor) -> Tensor:
     """Columns of the hidden nodes, of the slots in use, and the columns after them."""
-    slots = len(used)
-    sines, cosines = values[..., hidden : hidden + slots], values[..., hidden + slots : hidden + 2 * slots]
-    return torch.cat(
-        [values[..., :hidden], sines[..., used], cosines[..., used], values[..., hidden + 2 * slots :]], -1
-    )
+    return with_slots(values, hidden, len(used), lambda columns: columns[..., used])
 
 
 def _padded(weight: Tensor, read: int, unread: int) -> Tensor:

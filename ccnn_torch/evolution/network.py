@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.evolution.genome import kept
+from ccnn_torch.evolution.genome import Genome, genomes_of, kept, named_genomes
 from ccnn_torch.evolution.waves import Waves, wave_signal
 from ccnn_torch.numerics.trees import mapped
 
@@ -196,19 +196,13 @@ class Bundle(NamedTuple):
     @property
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""
-        named = {f"mask_{layer}": mask for layer, mask in enumerate(self.masks)}
-        named |= {f"weight_{layer}": weight for layer, weight in enumerate(self.weights)}
-        return named | {"source": self.waves.source, "frequency": self.waves.frequency}
+        return named_genomes("", map(Genome, self.masks, self.weights)) | self.waves._asdict()
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor]) -> Bundle:
         """Inverse of `tensors`."""
-        layers = range(sum(name.startswith("mask_") for name in tensors))
-        return cls(
-            [tensors[f"mask_{layer}"] for layer in layers],
-            [tensors[f"weight_{layer}"] for layer in layers],
-            Waves(tensors["source"], tensors["frequency"]),
-        )
+        masks, weights = zip(*genomes_of(tensors), strict=True)
+        return cls(list(masks), list(weights), Waves(tensors["source"], tensors["frequency"]))
 
 
 def resized(bundle: Bundle, slots: int) -> Bundle:
@@ -219,15 +213,17 @@ def resized(bundle: Bundle, slots: int) -> Bundle:
     def fitted(values: Tensor) -> Tensor:
         return nn.functional.pad(values, (0, slots - have)) if slots > have else values[..., :slots]
 
-    def columns(values: Tensor) -> Tensor:
-        parts = torch.split(values, [hidden, have, have, values.shape[-1] - hidden - 2 * have], -1)
-        return torch.cat([parts[0], fitted(parts[1]), fitted(parts[2]), parts[3]], -1)
-
     return Bundle(
-        [*bundle.masks[:-1], columns(bundle.masks[-1])],
-        [*bundle.weights[:-1], columns(bundle.weights[-1])],
+        [*bundle.masks[:-1], with_slots(bundle.masks[-1], hidden, have, fitted)],
+        [*bundle.weights[:-1], with_slots(bundle.weights[-1], hidden, have, fitted)],
         mapped(fitted, bundle.waves),
     )
+
+
+def with_slots(values: Tensor, hidden: int, slots: int, fitted: Callable[[Tensor], Tensor]) -> Tensor:
+    """Columns of hidden nodes, then those of the slots' sines and of their cosines as `fitted` makes them, the rest."""
+    parts = torch.split(values, [hidden, slots, slots, values.shape[-1] - hidden - 2 * slots], -1)
+    return torch.cat([parts[0], fitted(parts[1]), fitted(parts[2]), parts[3]], -1)
 
 
 def without_waves(bundle: Bundle) -> Bundle:

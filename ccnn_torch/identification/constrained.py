@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ from ccnn_torch.identification import (
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig
 from ccnn_torch.identification.measured import Kinematics, Measured, Rows, nominal_machine
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
-from ccnn_torch.identification.result import Found, Known, assemble
+from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
 from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
 from ccnn_torch.records import Records, Table, stack_columns
@@ -375,17 +375,11 @@ def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
 
 def _known(fit: ConstraintFit) -> Known:
     """The machine's part of what is known; a parameter that only its prior determines has no interval."""
-    k, knowledge = len(fit.selection.parameters), fit.knowledge
+    knowledge = fit.knowledge
     determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * fit.after.problem.prior_sd)
-    sd = torch.where(determined, knowledge.sd, math.inf)[:, :k]
     noise = knowledge.noise if fit.after.problem.noise_known else torch.ones(1, dtype=torch.float64)
-    return Known(
-        sd=sd,
-        combinations=list(knowledge.combinations),
-        correlation=knowledge.correlation[0, :k, :k].clone(),
-        singular_values=[knowledge.singular_values[0].tolist()],
-        noise=noise,
-        freedom=knowledge.freedom,
+    return known_of(
+        [replace(knowledge, sd=torch.where(determined, knowledge.sd, math.inf), noise=noise)], fit.selection
     )
 
 

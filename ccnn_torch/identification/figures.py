@@ -59,7 +59,7 @@ def pose_distribution_plot(results: Results, arrays: Arrays) -> Plot | None:
             dashed = "--" if colour == FLOOR else "-"
             axes.plot(sorted_values, share, dashed, color=colour, label=label, linewidth=2)
         axes.set_xscale("log")
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        _plain(axes.xaxis)
         axes.set(xlabel=f"{name} error [{unit}]", ylabel="share of poses [%]", ylim=(0, 101))
         axes.set_title(name.capitalize())
         axes.legend(loc="upper left")
@@ -69,6 +69,17 @@ def pose_distribution_plot(results: Results, arrays: Arrays) -> Plot | None:
     if "constraint" in results:
         caption = f"Share of the held-out rows that are at most so far from where {holder(results)} the tool: "
     return Plot("pose_error", figure, caption + " and ".join(texts) + ".")
+
+
+def _drawing(width: float, height: float) -> tuple[Figure, Any]:
+    """A figure [inches] with one pair of axes."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots()
+
+
+def _plain(axis: Any) -> None:
+    """Numbers of a logarithmic axis without powers of ten."""
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
 def _pooled(values: Array) -> Array:
@@ -89,8 +100,7 @@ def deviation_plots(results: Results, arrays: Arrays) -> list[Plot]:
             continue
         tables = {m: np.abs(arrays[f"deviation_{m}"][:, at]) for m in methods}
         scale, shown = display_unit(unit, float(max(np.median(t) for t in tables.values())) or 1.0)
-        figure = Figure(figsize=(9.2, 3.8), layout="constrained")
-        axes = figure.subplots()
+        figure, axes = _drawing(9.2, 3.8)
         for k, (method, table) in enumerate(tables.items()):
             x = np.arange(len(at)) + 0.7 * ((k + 0.5) / len(methods) - 0.5)
             low, middle, high = np.quantile(table, (0.05, 0.5, 0.95), axis=0) / scale
@@ -109,7 +119,7 @@ def deviation_plots(results: Results, arrays: Arrays) -> list[Plot]:
             label="bound (1σ)",
         )
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        _plain(axes.yaxis)
         axes.set_xticks(range(len(at)), [free[i][0] for i in at], rotation=60, ha="right")
         axes.set_ylabel(f"|identified - true| [{shown}]")
         figure.legend(loc="outside upper center", ncols=min(len(methods) + 1, 7))
@@ -135,8 +145,7 @@ def count_plot(results: Results) -> Plot | None:
     counts = results["counts"]
     if not counts:
         return None
-    figure = Figure(figsize=(6.4, 3.6), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _drawing(6.4, 3.6)
     poses = [entry["poses"] for entry in counts]
     for k, method in enumerate(counts[0]["methods"]):
         blocks = [entry["methods"][method] for entry in counts]
@@ -149,7 +158,7 @@ def count_plot(results: Results) -> Plot | None:
     axes.set(xlabel="poses measured", ylabel="RMS position error left [mm]", yscale="log", xscale="log")
     axes.set_xticks(poses, [str(p) for p in poses])
     axes.minorticks_off()
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    _plain(axes.yaxis)
     axes.legend()
     return Plot(
         "measurements",
@@ -168,12 +177,11 @@ def residual_plot(arrays: Arrays) -> Plot | None:
     before, after = (
         np.concatenate([arrays[f"residual_{w}_{n}"].reshape(-1) for n in numbers]) for w in ("before", "after")
     )
-    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _drawing(7.2, 3.2)
     for values, colour, label in ((before, BEFORE, "before"), (after, AFTER, "after")):
         axes.plot(np.arange(1, len(values) + 1), np.abs(values), "o", color=colour, markersize=3, label=label)
     axes.set(xlabel="equation", ylabel="|residual| / its noise", yscale="log")
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    _plain(axes.yaxis)
     axes.legend()
     rms = [number_text(float(np.sqrt(np.mean(np.square(v)))), 3) for v in (before, after)]
     return Plot(
@@ -242,8 +250,7 @@ def correlation_plot(results: Results, arrays: Arrays) -> Plot | None:
     names = [name for name, block in results["parameters"].items() if block["free"]]
     names = names if len(names) == len(matrix) else [str(i + 1) for i in range(len(matrix))]
     side = 2.2 + 0.2 * len(names)
-    figure = Figure(figsize=(side + 1.0, side), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _drawing(side + 1.0, side)
     image = axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
     bare(axes)
     axes.set_xticks(range(len(names)), names, rotation=90)
@@ -265,8 +272,7 @@ def singular_value_plot(results: Results) -> Plot | None:
     lists = [np.asarray(values, dtype=np.float64) for values in results["singular_values"] if values]
     if not lists:
         return None
-    figure = Figure(figsize=(6.0, 3.2), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _drawing(6.0, 3.2)
     for k, values in enumerate(lists):
         label = f"leg {k + 1}" if len(lists) > 1 else None
         axes.plot(np.arange(1, len(values) + 1), values, "o-", color=SERIES[k % len(SERIES)], label=label)

@@ -27,7 +27,6 @@ from ccnn_torch.identification.solve import (
     QUICK,
     Outcome,
     frames_first,
-    free_values,
     is_apart,
     load_outcome,
     pieces_of,
@@ -184,13 +183,12 @@ def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: Mapping[str
         raise InputError(f"bootstrap: {method} takes too long to be run again and again; put lm first in methods")
     selection, outcome = select(measured, config), outcomes[method]
     one, solver = torch.arange(1), solver_of(method, config)
-    names = [p.name for p in selection.parameters]
-    sd = torch.full((len(names),), torch.nan, dtype=torch.float64)
-    found = free_values(selection, outcome.values[:1])
+    found = selection.free(outcome.values[:1])
+    sd = torch.full_like(found[0], torch.nan)
     for number, piece in enumerate(pieces_of(measured, config, is_apart(method, config), one)):
-        at = torch.tensor([names.index(p.name) for p in piece.problem.parameters])
+        at = selection.places(piece.parameters)
         fit = Fit(found[:, at], torch.zeros(1), outcome.converged[:1], 0, "")
-        sd[at] = bootstrap(piece.problem, fit, solver, config.bootstrap, config.seed + number).sd()[0]
+        sd[at] = bootstrap(piece, fit, solver, config.bootstrap, config.seed + number).sd()[0]
     return sd
 
 

@@ -18,7 +18,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig, SimulateConfig, base_method
 from ccnn_torch.identification.judge import commanded, figures
 from ccnn_torch.identification.measured import Kinematics, Measured, Rows, make_kinematics
-from ccnn_torch.identification.solve import QUICK, Outcome, free_values, pieces_of, run_method, select
+from ccnn_torch.identification.solve import QUICK, Outcome, leg_of, pieces_of, run_method, select
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.planning import choose_poses
 from ccnn_torch.simulation.places import Instrument, Places, generator_of, make_instrument, normal_draws
@@ -70,7 +70,7 @@ def plan_places(
         joint_noise=joint_noise,
     )
     one = torch.arange(1)
-    whole = pieces_of(nominal, config, False, one)[0].problem
+    whole = pieces_of(nominal, config, False, one)[0]
     common = candidates[choose_poses(whole, count).chosen]
     if about.design != "planned_per_leg":
         return common, {}
@@ -80,7 +80,7 @@ def plan_places(
         raise InputError(
             f"simulate.poses: {count} poses cannot be dealt to {len(legs)} legs; write a multiple of {len(legs)}"
         )
-    return common, {leg.leg: candidates[choose_poses(leg.problem, each).chosen] for leg in legs if leg.leg is not None}
+    return common, {leg_of(leg): candidates[choose_poses(leg, each).chosen] for leg in legs}
 
 
 # Streams of random numbers of a machine, so that more poses do not change its errors.
@@ -166,7 +166,7 @@ def count_study(config: IdentifyConfig, mechanism: Mechanism) -> list[dict[str, 
             outcome: Outcome = run_method(method, measured, config)
             found = commanded(measured, outcome.values, outcome.machines)
             assert found is not None and measured.truth is not None
-            gap = free_values(select(measured, config), outcome.values - measured.truth[outcome.machines])
+            gap = select(measured, config).free(outcome.values - measured.truth[outcome.machines])
             block["methods"][method] = figures(
                 {"position": found.exact.position.square().mean(-1).sqrt(), "deviation": gap.abs().mean(-1)}
             )

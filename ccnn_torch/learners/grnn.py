@@ -12,8 +12,8 @@ from torch import Tensor
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.settings import check_least
 from ccnn_torch.learners.grnn_network import FARTHEST, GRNNNetwork, KernelVariance, blocked_means
-from ccnn_torch.learners.protocol import TrainingData
-from ccnn_torch.learners.rows import mean_square, usable_rows
+from ccnn_torch.learners.protocol import TrainingData, weighted_mse
+from ccnn_torch.learners.rows import usable_rows
 
 # Streams of random numbers: which rows are judged, and the moves of each step.
 _ROWS, _MOVES = 0, 1
@@ -277,10 +277,9 @@ class GRNN:
         """Mean squared error of the model on all training rows, or on the judged ones where there are more; `r`."""
         judged, rows = self._judged, self._data
         if rows.weights.shape[1] <= self.settings.references:
-            return mean_square(self.predict(rows.inputs) - rows.targets, rows.weights)
+            return weighted_mse(self.predict(rows.inputs), rows.targets, rows.weights)
         here = slice(0, judged.queries)
-        error = self.predict(judged.inputs[:, here]) - judged.targets[:, here]
-        return mean_square(error, judged.weights[:, here])
+        return weighted_mse(self.predict(judged.inputs[:, here]), judged.targets[:, here], judged.weights[:, here])
 
     def _narrowed(self, inverse: Tensor) -> Tensor:
         """1 / h for the use of all rows, `r x i`: bandwidths shrink as rows ** (-1 / (4 + inputs that are on))."""

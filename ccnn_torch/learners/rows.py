@@ -45,11 +45,6 @@ def thinned(data: TrainingData, most: int) -> TrainingData:
     return replace(data, inputs=inputs, targets=targets, weights=weights, metric=metric)
 
 
-def mean_square(error: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean over rows, mean over outputs. error: `... x s x o`; weights: `... x s`; returns `...`."""
-    return (error.square().mean(-1) * weights).sum(-1) / weights.sum(-1)
-
-
 class OneNetwork(ABC):
     """Predictions and networks of a learner that has the data and says its model."""
 

@@ -1,5 +1,6 @@
 """One trainer for every learner: scaling, loop, callbacks, checkpoints."""
 
+from ccnn_torch.learners.protocol import weighted_mse as weighted_mse
 from ccnn_torch.training.scaling import Scaling as Scaling
 from ccnn_torch.training.trainer import (
     Callback as Callback,
@@ -9,5 +10,4 @@ from ccnn_torch.training.trainer import (
     save_checkpoint as save_checkpoint,
     tensor_digest as tensor_digest,
     train as train,
-    weighted_mse as weighted_mse,
 )

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.learners.protocol import Learner, TrainingData
+from ccnn_torch.learners.protocol import Learner, TrainingData, weighted_mse
+from ccnn_torch.numerics.trees import below, chosen
 
 
 class Callback(Protocol):
@@ -141,12 +142,6 @@ class Training:
     clock: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     converged: Tensor | None = None
     ended: bool = True
-
-
-def weighted_mse(predicted: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
-    """Mean squared error over rows and outputs. predicted, targets: `r x s x o`; weights: `r x s`; returns `r`."""
-    per_row = (predicted - targets).square().mean(-1)
-    return (per_row * weights).sum(-1) / weights.sum(-1)
 
 
 def train(
@@ -329,12 +324,12 @@ class _Run:
                 )
         device = self.data.inputs.device
         tensors = {name: value.to(device) for name, value in tensors.items()}
-        self.learner.load_state_dict(_part(tensors, "state."))
+        self.learner.load_state_dict(below(tensors, "state."))
         self.best_step, self.best_validation = tensors["best_step"], tensors["best_validation"]
         if self.chooses:
-            self.kept = _part(tensors, "kept.")
+            self.kept = below(tensors, "kept.")
         self.step, self.seconds, self.clock = int(about["step"]), float(about["seconds"]), list(about["clock"])
-        history = _part(tensors, "history.")
+        history = below(tensors, "history.")
         self.history = [{name: value[i] for name, value in history.items()} for i in range(self.step)]
 
     def _identity(self) -> dict[str, Any]:
@@ -350,13 +345,7 @@ class _Run:
         return {name: value.detach().clone() for name, value in self.learner.state_dict().items()}
 
     def _keep(self, improved: Tensor) -> None:
-        state = self.learner.state_dict()
-        for name, value in state.items():
-            if value.dim() == 0:
-                self.kept[name] = value.clone()
-            else:
-                chosen = improved.view(-1, *([1] * (value.dim() - 1)))
-                self.kept[name] = torch.where(chosen, value, self.kept[name])
+        self.kept = chosen(improved, self._copy_state(), self.kept)
         self.best_step = torch.where(improved, torch.full_like(self.best_step, self.step), self.best_step)
 
 
@@ -367,7 +356,7 @@ def past_of(path: Path) -> tuple[dict[str, Tensor], Tensor]:
         InputError: the checkpoint is damaged.
     """
     tensors, about = load_checkpoint(path)
-    return _part(tensors, "history."), torch.tensor(about["clock"], dtype=torch.float64)
+    return below(tensors, "history."), torch.tensor(about["clock"], dtype=torch.float64)
 
 
 @contextmanager
@@ -379,10 +368,6 @@ def _told(learner: Learner, when: str) -> Iterator[None]:
         # Its first line is the reason; the others are for callers of the routine.
         sentence = str(problem).splitlines()[0].removeprefix("linalg.")
         raise MethodFailedError(f"{learner.name} met a matrix that cannot be factorised {when} ({sentence})") from None
-
-
-def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def _stack(history: list[dict[str, Tensor]]) -> dict[str, Tensor]:
