@@ -16,8 +16,7 @@ from typing import Any
 
 from ccnn_torch.display import number_text
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.identify import RESULTS
-from ccnn_torch.identification.job import IDENTIFY
+from ccnn_torch.identification.identify import IDENTIFY, RESULTS
 from ccnn_torch.identification.judge import figure_text
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.screen import stdout

@@ -345,7 +345,6 @@ def identify_by_constraint(
         kinematics=Kinematics(mechanism),
         view=mechanism,
         rows=Rows(rows.joints[None, ~held], rows.said[None, ~held]),
-        leg_rows={},
         test=Rows(rows.joints[None, held], rows.said[None, held]),
         start=fit.before.geometry[None],
         data_hash=rows.data_hash,

@@ -1,4 +1,4 @@
-"""From rows to the identified parameters of every method, their figures, and the folder with all of it."""
+"""`ccnn identify`: from rows to the identified parameters of every method, their figures, and the folder of it all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.config.split import Given
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Fit, Progress
 from ccnn_torch.identification.config import IdentifyConfig, base_method
@@ -20,7 +20,7 @@ from ccnn_torch.identification.constrained import identify_by_constraint
 from ccnn_torch.identification.identifiability import bootstrap
 from ccnn_torch.identification.judge import map_error, read_elsewhere, transferred
 from ccnn_torch.identification.measured import Measured, from_records, nominal_machine
-from ccnn_torch.identification.page import identified_page, write_identified_csv, write_identified_report
+from ccnn_torch.identification.page import identified_page, not_settled, write_identified_csv, write_identified_report
 from ccnn_torch.identification.result import assemble, beside_truth, judged, promised, residuals_of
 from ccnn_torch.identification.simulated import count_study, simulate
 from ccnn_torch.identification.solve import (
@@ -42,7 +42,9 @@ from ccnn_torch.records.load import read_source
 from ccnn_torch.report.arrays import ARRAYS_FILE, save_tensors
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.results.identified import IdentifiedResults
-from ccnn_torch.run_folder.resume import check_fingerprint, fingerprint
+from ccnn_torch.report.screen import note, progress_bar, say_place, stdout
+from ccnn_torch.run_folder.folder import RunFolder, resume_hint
+from ccnn_torch.run_folder.resume import FolderJob, check_fingerprint, fingerprint
 
 Watch = Callable[[str], Progress]
 """Given a label, somewhere to report the share that is done."""
@@ -216,3 +218,31 @@ def write_outputs(found: Identification, folder: Path) -> None:
     if found.config.save_report:
         write_identified_report(folder, results)
     write_json(folder / RESULTS, IdentifiedResults.model_validate(results))
+
+
+def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, tables: bool) -> None:
+    path = folder.path
+    with progress_bar(quiet) as bar:
+
+        def watch(label: str) -> Progress:
+            task = bar.add_task(label, total=1.0)
+            return lambda done: bar.update(task, completed=done)
+
+        found = identify(config, path / "methods", watch)
+    if tables and not quiet:
+        # Before anything is written: what was found is not lost where the disk is full.
+        identified_page(found.results).show(stdout)
+    note("writing tables, plots and files …", quiet)
+    with resume_hint(f"ccnn identify --resume {path}"):
+        write_outputs(found, path)
+    if not quiet:
+        say_place(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
+    if found.results["methods"][found.results["method"]]["converged"] == 0:
+        raise MethodFailedError(
+            f"{not_settled(found.results)} What was written to {path} is there to look into it, not to use; more rows, "
+            "more starts (starts=10) or fewer free parameters may help"
+        )
+
+
+IDENTIFY = FolderJob("ccnn identify", IdentifyConfig, RESULTS, "methods/*.safetensors", lambda c: (c, None), _run)
+"""A config to a finished folder; `MethodFailedError` where all is written, but the first method did not converge."""

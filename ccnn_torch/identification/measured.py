@@ -95,9 +95,9 @@ class Measured:
         view: the mechanism as the instrument sees it; its pose coordinates are the columns of `Rows.observed`. The
             mechanism itself, or a view with the same parameters where points on the platform are measured.
         rows: from which all is identified.
-        leg_rows: rows for one leg alone, by leg, where each leg has poses of its own; else empty.
         test: held-out rows; their `observed` are poses of the mechanism.
         start: where the search begins, `r x K` [SI]: nominal, or with the frames fitted.
+        leg_rows: rows for one leg alone, by leg, where each leg has poses of its own; else empty.
         truth: the simulated machines' parameters, `r x K` [SI]; None for records.
         wanted, wanted_joints: held-out poses that machines are sent to, `r x t x p` [SI], and joints near by,
             `r x t x n` [SI], which select the branch; None for records.
@@ -113,9 +113,9 @@ class Measured:
     kinematics: Kinematics
     view: Mechanism
     rows: Rows
-    leg_rows: dict[int, Rows]
     test: Rows
     start: Tensor
+    leg_rows: dict[int, Rows] = field(default_factory=dict)
     truth: Tensor | None = None
     wanted: Tensor | None = None
     wanted_joints: Tensor | None = None
@@ -157,7 +157,6 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         kinematics=Kinematics(mechanism),
         view=mechanism,
         rows=train,
-        leg_rows={},
         test=test,
         start=start,
         pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),

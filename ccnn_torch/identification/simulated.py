@@ -63,7 +63,6 @@ def plan_places(
         kinematics=Kinematics(mechanism),
         view=instrument.view,
         rows=rows,
-        leg_rows={},
         test=rows,
         start=mechanism.nominal[None],
         pose_noise=pose_noise,

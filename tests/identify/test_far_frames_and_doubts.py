@@ -9,8 +9,7 @@ import torch
 import ccnn_torch
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.identify import Identification
-from ccnn_torch.identification.job import IDENTIFY
+from ccnn_torch.identification.identify import IDENTIFY, Identification
 from ccnn_torch.mechanisms import Framed, load_mechanism
 from ccnn_torch.records import write_table
 

@@ -14,7 +14,7 @@ from frozen import frozen
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.job import IDENTIFY
+from ccnn_torch.identification.identify import IDENTIFY
 from ccnn_torch.identification.page import write_identified_report
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Condition, Coordinate, plausible_error
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.mechanisms.mechanism import Mechanism, drawn_within
 from ccnn_torch.mechanisms.newton import carry_derivative
 from ccnn_torch.mechanisms.pose import Frame, frame_from_coordinates, frame_gap, frame_jacobian
 from ccnn_torch.mechanisms.simulators.simulator import Calls, Simulator, described, try_simulator
@@ -319,16 +319,17 @@ class BlackBox(Mechanism):
         Raises:
             InputError: fewer than one in a hundred has a pose.
         """
-        found: list[Tensor] = []
-        for _ in range(100):
-            draw = torch.rand(count, len(self.joints), generator=generator, dtype=torch.float64)
-            joints = self.joint_low + (self.joint_high - self.joint_low) * draw
-            found.append(joints[torch.isfinite(self.forward_kinematics(joints)).all(-1)])
-            if sum(map(len, found)) >= count:
-                return torch.cat(found)[:count]
-        raise InputError(
+        wrong = (
             f"simulator '{self.name}' returns NaN nearly everywhere between low and high of its joints; make them "
             "narrower, or let it return a pose"
+        )
+        return drawn_within(
+            self.joint_low,
+            self.joint_high,
+            count,
+            generator,
+            lambda joints: torch.isfinite(self.forward_kinematics(joints)).all(-1),
+            wrong,
         )
 
     def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
