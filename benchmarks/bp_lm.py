@@ -15,8 +15,7 @@ from benchmarks.measure import Row, compare
 from benchmarks.peers import pyrenn_fit
 from benchmarks.training import training_rows
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, network_of, residual
-from ccnn_torch.evolution.refinement import refine
-from ccnn_torch.evolution.refinement_state import RefinementSettings
+from ccnn_torch.evolution.refinement import RefinementSettings, refine
 
 STARTS, HIDDEN, ITERATIONS = 6, 20, 20
 # Iterations that pyrenn makes, and their share of all Jacobians of all starts: it makes one before the first, too.
@@ -25,12 +24,12 @@ SHARE = (FEW + 1) / (ITERATIONS + 1) / STARTS
 
 
 def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
-    """The same number of iterations on the same rows and starts, without the estimate of precisions."""
+    """The same number of iterations on the same rows and starts, before the first estimate of precisions."""
     draw = torch.Generator().manual_seed(1)
     shapes = [(HIDDEN, 3), (3, HIDDEN)]
     masks = [torch.ones(STARTS, *shape, dtype=torch.bool) for shape in shapes]
     weights = [torch.randn(STARTS, out, into + 1, generator=draw, dtype=torch.float64) for out, into in shapes]
-    settings = RefinementSettings(iterations=ITERATIONS, bayesian=False, tolerance=0.0)
+    settings = RefinementSettings(iterations=ITERATIONS, warm_up=ITERATIONS, tolerance=0.0)
     network = network_of([mask[:1] for mask in masks], True)
     first = torch.cat([w[0].flatten() for w in weights]).numpy()
     for rows in (60, 120, 240) if quick else (100, 1000, 10_000):

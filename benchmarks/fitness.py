@@ -12,7 +12,7 @@ import torch
 from benchmarks.generation import toy_rows
 from benchmarks.measure import Row, compare
 from benchmarks.peers import fitness_peers
-from ccnn_torch.evolution.evaluation import make_task, network_errors
+from ccnn_torch.evolution.coevolution import make_task, network_errors
 from ccnn_torch.evolution.genome import Genome
 
 SIZES, ROWS = [3, 12, 12, 3], 125

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from benchmarks.measure import Row, compare
 from benchmarks.peers import generation_peers
 from ccnn_torch.evolution import CCNNSettings
-from ccnn_torch.evolution.breeding import CONTESTANTS, CUTS, EXPONENT
-from ccnn_torch.evolution.coevolution import REPRESENTATIVES, advance, start
-from ccnn_torch.evolution.evaluation import EPSILON, make_task
+from ccnn_torch.evolution.coevolution import EPSILON, REPRESENTATIVES, advance, make_task, start
+from ccnn_torch.evolution.genome import CONTESTANTS, CUTS, EXPONENT
 
 Array = NDArray[np.float64]
 Individual = tuple[NDArray[np.bool_], Array]

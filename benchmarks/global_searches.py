@@ -3,10 +3,11 @@
     pip install 'ccnn-torch[benchmarks]'
     python -m benchmarks.global_searches experiments/overconstrained_2dof.yaml methods=[lm,hga,tikhonov,ga,sa,pso]
 
-Arguments are those of `ccnn identify`. `ga` and `pso` are pymoo's genetic algorithm and particle swarm with its
-defaults (Blank and Deb 2020), asked for their populations, which are evaluated together for all machines. `sa` is
-SciPy's generalised simulated annealing (Xiang et al. 1997) without its local search. All stay in the box of `WIDTH` and
-spend the same number of evaluations by default.
+Arguments are a config and overrides, as of `ccnn identify`; the paper's printed figures are shown beside
+(`papers.py`). `ga` and `pso` are pymoo's genetic algorithm and particle swarm with its defaults (Blank and Deb 2020),
+asked for their populations, which are evaluated together for all machines. `sa` is SciPy's generalised simulated
+annealing (Xiang et al. 1997) without its local search. All stay in the box of `WIDTH` and spend the same number of
+evaluations by default.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,9 +28,9 @@ from pymoo.core.problem import Problem as Box
 from pymoo.problems.static import StaticProblem
 from scipy.optimize import dual_annealing
 
-from ccnn_torch.cli import main
+from benchmarks.papers import main
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
-from ccnn_torch.identification.solvers.objective import FORBIDDEN, WIDTH, Objective
+from ccnn_torch.identification.solvers.hga import FORBIDDEN, WIDTH, Objective
 from ccnn_torch.identification.solvers.registry import SOLVERS
 
 
@@ -133,5 +135,4 @@ def _fit(objective: Objective, points: torch.Tensor, evaluations: int) -> Fit:
 
 if __name__ == "__main__":
     SOLVERS.update(SEARCHES)
-    sys.argv[:] = ["ccnn", "identify", *sys.argv[1:]]
-    main()
+    main(Path(sys.argv[1]), *sys.argv[2:])

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.learners import TrainingData, kernel as _kernel
+from ccnn_torch.learners import TrainingData, grnn_network as _kernel
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 
 

@@ -18,7 +18,7 @@ from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import RUN
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.job import IDENTIFY
+from ccnn_torch.identification.identify import IDENTIFY
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.report.json_files import plain
 

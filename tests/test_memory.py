@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
-from ccnn_torch.evolution.evaluation import make_task, network_errors
+from ccnn_torch.evolution.coevolution import make_task, network_errors
 from ccnn_torch.evolution.gauss_newton import linearise, network_of, residual
 from ccnn_torch.evolution.genome import Genome
 from ccnn_torch.evolution.settings import CCNNSettings

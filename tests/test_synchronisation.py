@@ -18,9 +18,9 @@ from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ccnn_torch.evolution import CCNNSettings
-from ccnn_torch.evolution.coevolution import advance, start
-from ccnn_torch.evolution.evaluation import make_task
+from ccnn_torch.evolution.coevolution import advance, make_task, start
 from ccnn_torch.evolution.refinement import (
+    RefinementSettings,
     finish_refinement,
     pose_refinement,
     refine,
@@ -28,7 +28,6 @@ from ccnn_torch.evolution.refinement import (
     start_refinement,
     step_refinement,
 )
-from ccnn_torch.evolution.refinement_state import RefinementSettings
 
 # Operations whose result, or its size, the host has to know; of indexing those by a mask.
 _WAITING = {"_local_scalar_dense", "nonzero", "is_nonzero", "item", "masked_select", "equal", "_unique2"}

@@ -143,7 +143,7 @@ def identify(
 
     ccnn compensate runs/arm/identified.yaml poses.csv commands.csv --pose
     """
-    from ccnn_torch.identification.job import IDENTIFY
+    from ccnn_torch.identification.identify import IDENTIFY
 
     if keys:
         from ccnn_torch.config.keys import list_keys

@@ -1,15 +1,17 @@
-"""Masked networks: forward pass, dead nodes (paper 000, section III-E), averages and pruning."""
+"""Masked networks with periodic nodes: forward pass, dead nodes (paper 000, section III-E), averages, pruning."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from ccnn_torch.evolution.genome import kept
+from ccnn_torch.evolution.genome import Genome, genomes_of, kept, named_genomes
 from ccnn_torch.evolution.waves import Waves, wave_signal
+from ccnn_torch.numerics.trees import mapped
 
 
 def fed_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
@@ -171,3 +173,65 @@ def prune(masks: Sequence[Tensor], weights: Sequence[Tensor]) -> tuple[list[Tens
         small_masks.append(mask[rows][:, columns])
         small_weights.append(weight[rows][:, with_bias])
     return small_masks, small_weights
+
+
+class Bundle(NamedTuple):
+    """Networks of one shape.
+
+    Attributes:
+        masks, weights: one a layer, `... x out x in` and `... x out x (in or in + 1)`; those of the output have two
+            columns for each slot of a periodic node behind those of the last hidden layer.
+        waves: `... x k`.
+    """
+
+    masks: list[Tensor]
+    weights: list[Tensor]
+    waves: Waves
+
+    @property
+    def slots(self) -> int:
+        """Slots for periodic nodes of each network."""
+        return self.waves.frequency.shape[-1]
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return named_genomes("", map(Genome, self.masks, self.weights)) | self.waves._asdict()
+
+    @classmethod
+    def from_tensors(cls, tensors: dict[str, Tensor]) -> Bundle:
+        """Inverse of `tensors`."""
+        masks, weights = zip(*genomes_of(tensors), strict=True)
+        return cls(list(masks), list(weights), Waves(tensors["source"], tensors["frequency"]))
+
+
+def resized(bundle: Bundle, slots: int) -> Bundle:
+    """The same networks with fewer free slots for periodic nodes (the last ones go), or more."""
+    have = bundle.slots
+    hidden = bundle.masks[-1].shape[-1] - 2 * have
+
+    def fitted(values: Tensor) -> Tensor:
+        return nn.functional.pad(values, (0, slots - have)) if slots > have else values[..., :slots]
+
+    return Bundle(
+        [*bundle.masks[:-1], with_slots(bundle.masks[-1], hidden, have, fitted)],
+        [*bundle.weights[:-1], with_slots(bundle.weights[-1], hidden, have, fitted)],
+        mapped(fitted, bundle.waves),
+    )
+
+
+def with_slots(values: Tensor, hidden: int, slots: int, fitted: Callable[[Tensor], Tensor]) -> Tensor:
+    """Columns of hidden nodes, then those of the slots' sines and of their cosines as `fitted` makes them, the rest."""
+    parts = torch.split(values, [hidden, slots, slots, values.shape[-1] - hidden - 2 * slots], -1)
+    return torch.cat([parts[0], fitted(parts[1]), fitted(parts[2]), parts[3]], -1)
+
+
+def without_waves(bundle: Bundle) -> Bundle:
+    """The sigmoid networks alone."""
+    return resized(bundle, 0)
+
+
+def averaged(bundle: Bundle) -> Bundle:
+    """The mean of the networks along the last leading dimension, as one network each."""
+    masks, weights = average(bundle.masks, bundle.weights, bundle.slots)
+    return Bundle(masks, weights, average_waves(bundle.waves))

@@ -14,29 +14,180 @@ the same in steps, with everything that changes in a `RefinementState` of plain 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.gauss_newton import linearise, network_of, residual
-from ccnn_torch.evolution.priors import prior_groups, wave_groups
-from ccnn_torch.evolution.refinement_state import (
-    Precisions,
-    Refined,
-    RefinementProblem,
-    RefinementSettings,
-    RefinementState,
-    SecondOrder,
-    part_of_problem,
-)
+from ccnn_torch.evolution.gauss_newton import Network, linearise, network_of, prior_groups, residual, wave_groups
 from ccnn_torch.evolution.waves import Waves
 from ccnn_torch.numerics.trees import chosen, picked, put
+
+# Calm iterations after which a network is done.
+_CALM = 3
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """How to refine.
+
+    Attributes:
+        iterations: Levenberg-Marquardt iterations.
+        warm_up: iterations before the first estimate of the precisions.
+        tolerance: a network whose objective falls by less than this share in each of three iterations running is done;
+            0 = the objective ends none.
+        patience: iterations without a rise of the log evidence by 1 nat after which a network is done; it ends with
+            the weights and precisions of the highest evidence.
+    """
+
+    iterations: int = 50
+    warm_up: int = 3
+    tolerance: float = 1e-5
+    patience: int = 6
+
+
+@dataclass(frozen=True)
+class RefinementProblem:
+    """What stays fixed: `b` networks (the leading dimensions in one), their data and the settings.
+
+    Attributes:
+        network: masks of the `b` networks and what follows from them.
+        inputs: `b x s x i`.
+        targets: `b x s x o`.
+        rows: row weights, `b x s`.
+        metric: `b x s x c x o`, or None.
+        groups: prior group of every weight, `k`, int64; the last group is never held back.
+        leading: the leading dimensions as given.
+        group_count: number of prior groups, that last one included.
+        wave_groups: which of them are of periodic nodes, int64.
+        settings: as given.
+    """
+
+    network: Network
+    inputs: Tensor
+    targets: Tensor
+    rows: Tensor
+    metric: Tensor | None
+    groups: Tensor
+    leading: tuple[int, ...]
+    group_count: int
+    wave_groups: Tensor
+    settings: RefinementSettings
+
+
+@dataclass(frozen=True)
+class RefinementState:
+    """What changes from iteration to iteration.
+
+    Attributes:
+        weights: `b x k`.
+        damping: `b`.
+        prior: precision of each prior group, `b x g`.
+        noise: precision of each channel's noise, `b x c`.
+        effective: weights determined by the data, per prior group, `b x g`.
+        calm: iterations running that lowered the objective by less than the tolerance, `b` int64.
+        iteration: iterations done, 0-d, int64.
+    """
+
+    weights: Tensor
+    damping: Tensor
+    prior: Tensor
+    noise: Tensor
+    effective: Tensor
+    calm: Tensor
+    iteration: Tensor
+
+    @property
+    def done(self) -> Tensor:
+        """Networks that do not move any more, `b` bool."""
+        return self.calm >= _CALM
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    @classmethod
+    def from_state_dict(cls, state: dict[str, Tensor]) -> RefinementState:
+        """Inverse of `state_dict`."""
+        return cls(**{f.name: state[f.name] for f in fields(cls)})
+
+
+class SecondOrder(NamedTuple):
+    """Gradient `b x m` and Gauss-Newton matrix `b x m x m` of the objective in the network's kept weights.
+
+    Inactive ones among them have the gradient 0 and 1 on the diagonal. `root` is the matrix's Cholesky factor, and
+    `failed` (`b`) not 0 where it has none.
+    """
+
+    gradient: Tensor
+    matrix: Tensor
+    root: Tensor
+    failed: Tensor
+
+
+class Precisions(NamedTuple):
+    """What a refinement has estimated beside the weights; 0 = not known.
+
+    Attributes:
+        prior: precision of each prior group, `... x g`.
+        noise: precision of each channel's noise, `... x c`.
+        damping: `...`.
+    """
+
+    prior: Tensor
+    noise: Tensor
+    damping: Tensor
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Refined networks.
+
+    Attributes:
+        weights: per layer `... x out x in (+ 1)`; those that take no part are as they were given.
+        waves: periodic nodes with their refined frequencies, `... x k`.
+        error: weighted mean square of the residual in its channels, on the rows refined on, `...`.
+        objective: misfit and penalty under the last precisions, `...`.
+        effective_parameters: weights determined by the data, `...`.
+        noise: precision of each channel's noise, `... x c`.
+        log_evidence: logarithm of the probability of the targets given the masks and precisions, up to a constant of
+            the data (MacKay 1992, eq. 2.23); compares networks refined on the same rows. `...`.
+        precisions: with which it ended.
+        iterations: iterations done.
+    """
+
+    weights: list[Tensor]
+    waves: Waves
+    error: Tensor
+    objective: Tensor
+    effective_parameters: Tensor
+    noise: Tensor
+    log_evidence: Tensor
+    precisions: Precisions
+    iterations: int
+
+
+def part_of_problem(problem: RefinementProblem, index: Tensor) -> RefinementProblem:
+    """The problem of some of the networks, numbered as in the batch; they lead in one dimension."""
+    if len(index) == len(problem.rows):
+        return problem
+    parts = {name: picked(getattr(problem, name), index) for name in ("network", "inputs", "targets", "rows", "metric")}
+    return replace(problem, leading=(len(index),), **parts)
+
 
 _PRECISION_RANGE = (1e-8, 1e12)
 _DAMPING_RANGE = (1e-12, 1e12)
 _VAGUE = 1e-4
+# Prior precision before its first estimate, and the first damping, relative to the diagonal of H.
+_FIRST_PRIOR, _FIRST_DAMPING = 1e-3, 1e-2
+# Gamma distribution that the prior precisions are drawn from; they then are (gamma + 2 shape) / (sum w^2 + 2 rate).
+# With a hundred rows and small groups of weights this holds back what the estimate of gamma alone would let through;
+# with many rows it makes no difference.
+_PRIOR_SHAPE, _PRIOR_RATE = 1.0, 0.1
+# Dampings tried in an iteration before it is given up.
+_TRIALS = 6
 # A rise of the log evidence that is worth an iteration: odds of less than 3 to 1 choose nothing.
 _NATS = 1.0
 
@@ -86,7 +237,7 @@ def refine(
         # Networks do not know of each other, so that those which are done need not be worked on for the others' sake.
         part, now = part_of_problem(problem, going), picked(state, going)
         local = second_order(part, now)
-        if problem.settings.bayesian and int(state.iteration) > problem.settings.warm_up:
+        if int(state.iteration) > problem.settings.warm_up:
             evidence = log_evidence(part, now, local)
             risen = evidence > highest[going]
             best = put(best, going, chosen(risen, now, picked(best, going)))
@@ -94,7 +245,7 @@ def refine(
             stale = stale.index_copy(0, going, torch.where(much, 0, stale[going] + 1))
             highest = highest.index_copy(0, going, torch.where(risen, evidence, highest[going]))
         state = put(state, going, step_refinement(part, now, local))
-    if problem.settings.bayesian and bool((highest > -torch.inf).any()):
+    if bool((highest > -torch.inf).any()):
         # The last one has not been judged; re-estimated precisions may have taken it downhill.
         last = log_evidence(problem, state)
         worse = torch.nonzero(~(last >= highest) & (highest > -torch.inf)).flatten()
@@ -155,21 +306,20 @@ def start_refinement(
     problem: RefinementProblem, weights: list[Tensor], waves: Waves | None = None, known: Precisions | None = None
 ) -> RefinementState:
     """State before the first iteration. weights: per layer `... x out x in (+ 1)`; waves and known as in `refine`."""
-    settings = problem.settings
     parts = [_flatten(w, problem.leading, 2).flatten(1) for w in weights]
     if waves is not None:
         parts.append(_flatten(waves.frequency, problem.leading, 1))
     flat = torch.cat(parts, dim=-1)
     batch = flat.shape[0]
     group_count = problem.group_count
-    prior = flat.new_full((batch, group_count), settings.first_prior if settings.bayesian else settings.ridge)
+    prior = flat.new_full((batch, group_count), _FIRST_PRIOR)
     prior[:, -1] = _PRECISION_RANGE[0]
     channels = problem.targets.shape[-1] if problem.metric is None else problem.metric.shape[-2]
     noise = flat.new_ones(batch, channels)
     effective = flat.new_zeros(batch, group_count)
     state = RefinementState(
         weights=flat,
-        damping=flat.new_full((batch,), settings.damping),
+        damping=flat.new_full((batch,), _FIRST_DAMPING),
         prior=prior,
         noise=noise,
         effective=effective,
@@ -177,8 +327,6 @@ def start_refinement(
         # Counted by the host, which need not wait to read it.
         iteration=torch.zeros((), dtype=torch.int64, device="cpu"),
     )
-    if not settings.bayesian:
-        return state
     state = replace(state, noise=_noise(problem, state))
     if known is None:
         return state
@@ -206,7 +354,7 @@ def step_refinement(
     weights, damping, kept = state.weights, state.damping, problem.network.kept_flat
     reached = before
     todo = torch.arange(len(before), device=before.device)
-    for _ in range(problem.settings.trials):
+    for _ in range(_TRIALS):
         damped = matrix[todo]
         damped.diagonal(dim1=-2, dim2=-1).add_(diagonal[todo] * damping[todo].unsqueeze(-1))
         root, failed = torch.linalg.cholesky_ex(damped)
@@ -228,7 +376,7 @@ def step_refinement(
         calm=torch.where(before - reached < problem.settings.tolerance * before, state.calm + 1, 0),
         iteration=state.iteration + 1,
     )
-    if not problem.settings.bayesian or int(moved.iteration) <= problem.settings.warm_up:
+    if int(moved.iteration) <= problem.settings.warm_up:
         return moved
     return _estimate_precisions(problem, moved, known)
 
@@ -329,7 +477,7 @@ def _estimate_precisions(problem: RefinementProblem, state: RefinementState, kno
     # A periodic node is there or it is not: nothing is known of its amplitude, and the data alone may switch it off.
     share = torch.ones(group_count, dtype=squares.dtype, device=squares.device)
     share[problem.wave_groups] = _VAGUE
-    shape, rate = problem.settings.prior_shape * share, problem.settings.prior_rate * share
+    shape, rate = _PRIOR_SHAPE * share, _PRIOR_RATE * share
     prior = ((effective + 2 * shape) / (squares + 2 * rate)).clamp(*_PRECISION_RANGE)
     prior[:, -1] = _PRECISION_RANGE[0]
     usable = ((failed == 0) & effective.isfinite().all(-1)).unsqueeze(-1)

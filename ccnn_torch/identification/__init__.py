@@ -1,8 +1,9 @@
 """Geometric parameters of a machine from measured records."""
 
-from ccnn_torch.identification.identifiability.bootstrap import Bootstrap as Bootstrap, bootstrap as bootstrap
-from ccnn_torch.identification.identifiability.knowledge import (
+from ccnn_torch.identification.identifiability import (
+    Bootstrap as Bootstrap,
     Knowledge as Knowledge,
+    bootstrap as bootstrap,
     require_identifiable as require_identifiable,
     what_is_known as what_is_known,
 )
@@ -13,12 +14,14 @@ from ccnn_torch.identification.problems.constraints import (
     socket_problem as socket_problem,
     tool_points as tool_points,
 )
-from ccnn_torch.identification.problems.forward import forward_problem as forward_problem
-from ccnn_torch.identification.problems.inverse import inverse_problem as inverse_problem
 from ccnn_torch.identification.problems.parameters import (
     ParameterChoice as ParameterChoice,
     Selection as Selection,
     select_parameters as select_parameters,
+)
+from ccnn_torch.identification.problems.poses import (
+    forward_problem as forward_problem,
+    inverse_problem as inverse_problem,
 )
 from ccnn_torch.identification.problems.problem import (
     Channel as Channel,
@@ -26,11 +29,10 @@ from ccnn_torch.identification.problems.problem import (
     Problem as Problem,
     Progress as Progress,
     Solver as Solver,
+    split_by_leg as split_by_leg,
 )
-from ccnn_torch.identification.solvers.legs import split_by_leg as split_by_leg
-from ccnn_torch.identification.solvers.lm import solve_lm as solve_lm
+from ccnn_torch.identification.solvers.lm import LOSSES as LOSSES, reweighted as reweighted, solve_lm as solve_lm
 from ccnn_torch.identification.solvers.registry import SOLVERS as SOLVERS, get_solver as get_solver
-from ccnn_torch.identification.solvers.robust import LOSSES as LOSSES, reweighted as reweighted
 from ccnn_torch.identification.solvers.tikhonov import (
     LCurve as LCurve,
     l_curve as l_curve,

@@ -184,9 +184,6 @@ class IdentifyConfig(JobConfig):
         default={}, description="settings of a method, e.g. {hga: {generations: 500}}"
     )
     bootstrap: int = Field(default=0, ge=0, description="resampled fits beside the formula's intervals; 0 = none")
-    paper: Literal["001", "004"] | None = Field(
-        default=None, description="paper whose printed figures are listed beside ours in the tables"
-    )
     save_report: bool = Field(default=True, description="draw plots/ and write report.html")
 
     @model_validator(mode="before")
@@ -252,7 +249,6 @@ class IdentifyConfig(JobConfig):
             "joint_noise": (self.joint_noise is not None, "has one noise, that of the whole; remove the key"),
             "transfer": (self.transfer is not None, "has no measured poses to transfer to; remove the key"),
             "bootstrap": (self.bootstrap > 0, "has the formula's intervals alone; remove the key"),
-            "paper": (self.paper is not None, "is in no paper; remove the key"),
             "split.kind": (self.split.kind == "block", "measures no positions to sort by; write random or group"),
             "constraint.plate_tolerance": (
                 constraint.kind != "sockets" and constraint.plate_tolerance is not None,

@@ -1,4 +1,4 @@
-"""From rows to the identified parameters of every method, and their figures."""
+"""`ccnn identify`: from rows to the identified parameters of every method, their figures, and the folder of it all."""
 
 from __future__ import annotations
 
@@ -12,36 +12,39 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.config.split import Given
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Fit, Progress
 from ccnn_torch.identification.config import IdentifyConfig, base_method
-from ccnn_torch.identification.constrained.identify import identify_by_constraint
-from ccnn_torch.identification.identifiability.bootstrap import bootstrap
-from ccnn_torch.identification.judge import map_error
-from ccnn_torch.identification.measured.measured import Measured
-from ccnn_torch.identification.measured.nominal import nominal_machine
-from ccnn_torch.identification.measured.records import from_records
+from ccnn_torch.identification.constrained import identify_by_constraint
+from ccnn_torch.identification.identifiability import bootstrap
+from ccnn_torch.identification.judge import map_error, read_elsewhere, transferred
+from ccnn_torch.identification.measured import Measured, from_records, nominal_machine
+from ccnn_torch.identification.page import identified_page, not_settled, write_identified_csv, write_identified_report
 from ccnn_torch.identification.result import assemble, beside_truth, judged, promised, residuals_of
-from ccnn_torch.identification.simulated.counts import count_study
-from ccnn_torch.identification.simulated.machines import simulate
+from ccnn_torch.identification.simulated import count_study, simulate
 from ccnn_torch.identification.solve import (
     QUICK,
     Outcome,
     frames_first,
-    free_values,
     is_apart,
+    load_outcome,
     pieces_of,
     run_method,
+    save_outcome,
     select,
     solver_of,
 )
-from ccnn_torch.identification.store import load_outcome, save_outcome
-from ccnn_torch.identification.transfer import read_elsewhere, transferred
 from ccnn_torch.mechanisms import Framed, Mechanism
+from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
-from ccnn_torch.run_folder.resume import check_fingerprint, fingerprint
+from ccnn_torch.report.arrays import ARRAYS_FILE, save_tensors
+from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.results.identified import IdentifiedResults
+from ccnn_torch.report.screen import note, progress_bar, say_place, stdout
+from ccnn_torch.run_folder.folder import RunFolder, resume_hint
+from ccnn_torch.run_folder.resume import FolderJob, check_fingerprint, fingerprint
 
 Watch = Callable[[str], Progress]
 """Given a label, somewhere to report the share that is done."""
@@ -72,8 +75,6 @@ class Identification:
 
     def save(self, folder: str | Path) -> None:
         """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`."""
-        from ccnn_torch.identification.outputs import write_outputs
-
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         config = self.config
@@ -184,13 +185,12 @@ def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: Mapping[str
         raise InputError(f"bootstrap: {method} takes too long to be run again and again; put lm first in methods")
     selection, outcome = select(measured, config), outcomes[method]
     one, solver = torch.arange(1), solver_of(method, config)
-    names = [p.name for p in selection.parameters]
-    sd = torch.full((len(names),), torch.nan, dtype=torch.float64)
-    found = free_values(selection, outcome.values[:1])
+    found = selection.free(outcome.values[:1])
+    sd = torch.full_like(found[0], torch.nan)
     for number, piece in enumerate(pieces_of(measured, config, is_apart(method, config), one)):
-        at = torch.tensor([names.index(p.name) for p in piece.problem.parameters])
+        at = selection.places(piece.parameters)
         fit = Fit(found[:, at], torch.zeros(1), outcome.converged[:1], 0, "")
-        sd[at] = bootstrap(piece.problem, fit, solver, config.bootstrap, config.seed + number).sd()[0]
+        sd[at] = bootstrap(piece, fit, solver, config.bootstrap, config.seed + number).sd()[0]
     return sd
 
 
@@ -201,3 +201,48 @@ def _fingerprint(measured: Measured) -> str:
     for table in (measured.start, *(t for r in rows for t in (r.joints, r.observed))):
         digest.update(table.contiguous().numpy().tobytes())
     return digest.hexdigest()
+
+
+RESULTS = "identified.json"
+
+
+def write_outputs(found: Identification, folder: Path) -> None:
+    """Write everything; `identified.json` comes last: a folder that has it is finished."""
+    results = found.results
+    write_identified_csv(folder / "identified.csv", results)
+    write_whole(folder / "identified.md", identified_page(results).markdown())
+    save_tensors(folder / ARRAYS_FILE, found.arrays)
+    # Of several machines the first.
+    config = found.config
+    write_machine(found.mechanism(), found.nominal(), folder, "identified", config.columns, config.joint_map)
+    if found.config.save_report:
+        write_identified_report(folder, results)
+    write_json(folder / RESULTS, IdentifiedResults.model_validate(results))
+
+
+def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, tables: bool) -> None:
+    path = folder.path
+    with progress_bar(quiet) as bar:
+
+        def watch(label: str) -> Progress:
+            task = bar.add_task(label, total=1.0)
+            return lambda done: bar.update(task, completed=done)
+
+        found = identify(config, path / "methods", watch)
+    if tables and not quiet:
+        # Before anything is written: what was found is not lost where the disk is full.
+        identified_page(found.results).show(stdout)
+    note("writing tables, plots and files …", quiet)
+    with resume_hint(f"ccnn identify --resume {path}"):
+        write_outputs(found, path)
+    if not quiet:
+        say_place(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
+    if found.results["methods"][found.results["method"]]["converged"] == 0:
+        raise MethodFailedError(
+            f"{not_settled(found.results)} What was written to {path} is there to look into it, not to use; more rows, "
+            "more starts (starts=10) or fewer free parameters may help"
+        )
+
+
+IDENTIFY = FolderJob("ccnn identify", IdentifyConfig, RESULTS, "methods/*.safetensors", lambda c: (c, None), _run)
+"""A config to a finished folder; `MethodFailedError` where all is written, but the first method did not converge."""

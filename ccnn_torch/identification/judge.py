@@ -1,14 +1,100 @@
-"""Pose error of an identified geometry: predicted, and under commands computed with it."""
+"""Pose errors of an identified geometry, as predicted and as commanded; many machines as one; warnings."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import torch
+from scipy.stats import chi2
 from torch import Tensor
 
-from ccnn_torch.identification.measured.measured import Measured
-from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.display import display_unit, number_text
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification.config import IdentifyConfig
+from ccnn_torch.identification.measured import Measured, Rows, read_records, split_records
+from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, fit_frames
 from ccnn_torch.numerics.least_squares import jacobian_of
+
+_LOW, _HIGH = 0.05, 0.95
+
+
+def figures(values: Mapping[str, Tensor | None]) -> dict[str, Any]:
+    """One number for each key, and `spread: {key: [low, high]}` where there are several machines.
+
+    Args:
+        values: `r` each; None, or a tensor without a finite number, gives None.
+    """
+    numbers: dict[str, Any] = {}
+    spread: dict[str, list[float]] = {}
+    for key, table in values.items():
+        known = None if table is None else table[torch.isfinite(table)]
+        if table is None or known is None or len(known) == 0:
+            numbers[key] = None
+            continue
+        numbers[key] = float(known.quantile(0.5))
+        if len(table) > 1:
+            spread[key] = [float(known.quantile(_LOW)), float(known.quantile(_HIGH))]
+    return numbers | ({"spread": spread} if spread else {})
+
+
+def figure_text(block: Mapping[str, Any] | None, key: str, scale: float = 1.0, digits: int = 3) -> str:
+    """One of the `figures` with its interval, or –."""
+    if block is None or block.get(key) is None:
+        return "–"
+    text = number_text(block[key] / scale, digits)
+    spread = block.get("spread", {}).get(key)
+    if spread is not None:
+        low, high = (number_text(v / scale, digits) for v in spread)
+        text += f" [{low}, {high}]"
+    return text
+
+
+def before_and_after(before: PoseError, after: PoseError, noise: PoseError | None = None) -> dict[str, Any]:
+    """Position and rotation: RMS and maximum over the poses of a machine, before and after.
+
+    Args:
+        before, after: `r x t`.
+        noise: of the measurement, `r x t`, where it is known.
+    """
+    answer: dict[str, Any] = {}
+    for name, unit, first, last, floor in zip(
+        PoseError._fields, ("m", "rad"), before, after, noise or (None, None), strict=True
+    ):
+        if first is None or last is None or float(first.abs().nan_to_num().max()) == 0:
+            answer[name] = None
+            continue
+        entries: dict[str, Tensor | None] = {
+            "before": _rms(first),
+            "after": _rms(last),
+            "max_before": first.amax(-1),
+            "max_after": last.amax(-1),
+        }
+        if floor is not None:
+            entries["noise"] = _rms(floor)
+        answer[name] = {"unit": unit} | figures(entries)
+    return answer
+
+
+def removed(before: PoseError, after: PoseError) -> dict[str, Any]:
+    """As `before_and_after`, with the share of the RMS that was removed."""
+    answer = before_and_after(before, after)
+    for name, first, last in zip(PoseError._fields, before, after, strict=True):
+        if answer[name] is None or first is None or last is None:
+            continue
+        share = figures({"removed": 1 - _rms(last) / _rms(first)})
+        answer[name]["removed"] = share["removed"]
+        if "spread" in share:
+            answer[name]["spread"] |= share["spread"]
+    return answer
+
+
+def _rms(values: Tensor) -> Tensor:
+    """`r x t` -> `r`."""
+    return values.square().mean(-1).sqrt()
 
 
 class Commanded(NamedTuple):
@@ -77,3 +163,101 @@ def map_error(measured: Measured, values: Tensor, machines: Tensor) -> Tensor | 
     reached = measured.kinematics.reached(joints, measured.truth[machines][:, None], place)
     # At the very edge a machine may not reach what the nominal one does: its NaN is no error of a position.
     return mechanism.pose_error(reached, place).position.square().nanmean(0).sqrt()
+
+
+# Residuals that chance makes as rarely as this do not fit the noise given; a ratio this near 1 is nothing to speak of.
+_RARE, _NEAR = 1e-3, 1.5
+# Held-out errors above so many times the noise, or this share of the error before, say that something else is wrong.
+_ABOVE_NOISE, _LITTLE_GAINED = 10.0, 0.5
+# An error within so many times the noise has nothing left to gain.
+_AT_NOISE = 2.0
+
+
+def doubts_of(
+    test: Mapping[str, Any], ratio: float | None, freedom: float, noise: float | None, noise_given: bool
+) -> list[str]:
+    """Whether the rows contradict the noise given, and whether too much is left of the held-out error.
+
+    Args:
+        test: `position` of before and after, as in `identified.json`.
+        ratio: standard deviation of the residual over the noise given [1].
+        freedom: equations to spare.
+        noise: of a measured position, all coordinates together [m]; None where it is not known.
+        noise_given: whether `ratio` compares with a noise that the config names.
+    """
+    said = []
+    if noise_given and ratio is not None and math.isfinite(ratio) and freedom > 0:
+        chance = chi2.sf(ratio**2 * freedom, freedom) if ratio > 1 else chi2.cdf(ratio**2 * freedom, freedom)
+        if chance < _RARE and ratio > _NEAR:
+            said.append(
+                f"The noise given does not fit the rows: their residuals are {ratio:.3g} times as large, so that the "
+                "noise is larger or more than the geometry is wrong, and the standard deviations are too small."
+            )
+        elif chance < _RARE and ratio < 1 / _NEAR:
+            said.append(
+                f"The noise given does not fit the rows: their residuals are {ratio:.2g} times as large, so that the "
+                "noise is smaller and the standard deviations are too large."
+            )
+    position = test["position"]
+    before, after = (None, None) if position is None else (position["before"], position["after"])
+    if before is None or after is None or (noise is not None and after <= _AT_NOISE * noise):
+        return said
+    if noise is not None and after > _ABOVE_NOISE * noise:
+        said.append(
+            f"The held-out position error is still {after / noise:.3g} times the noise ({_length(after)}, "
+            f"{_length(noise)}): something else is wrong beside the geometry that was identified."
+        )
+    if before > 0 and after > _LITTLE_GAINED * before:
+        said.append(
+            f"The held-out position error is still {100 * after / before:.0f} % of what it was: what was identified "
+            "explains little of it."
+        )
+    return said
+
+
+def _length(value: float) -> str:
+    scale, unit = display_unit("m", value)
+    return f"{number_text(value / scale, 3)} {unit}"
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Another series of measurements: rows that place the arm anew, and rows that judge; `arm` has nominal links."""
+
+    arm: SerialArm
+    train: Rows
+    test: Rows
+
+
+def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | None:
+    """The records of `transfer`, split as the others are; None where there are none."""
+    if config.transfer is None:
+        return None
+    if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:
+        raise InputError(
+            f"transfer: {mechanism.name} has no frame to be fitted anew; it takes a serial arm whose base_frame or "
+            "tool_frame is unknown"
+        )
+    records, arm = read_records(config, config.transfer, mechanism)
+    assert isinstance(arm, SerialArm)
+    return Elsewhere(arm, *split_records(config, records))
+
+
+def transferred(config: IdentifyConfig, elsewhere: Elsewhere, values: Tensor) -> dict[str, Any]:
+    """The block `transfer` of identified.json: pose errors with nominal and with identified links.
+
+    Args:
+        values: identified parameters, `k` [SI]; the frames are fitted anew to either.
+    """
+    train, test = elsewhere.train, elsewhere.test
+    errors = []
+    for nominal in (elsewhere.arm.nominal, values):
+        arm = elsewhere.arm.with_nominal(nominal)
+        assert isinstance(arm, SerialArm)
+        placed = fit_frames(arm, train.joints[0], train.observed[0], rotation_weight=config.rotation_weight)
+        errors.append(arm.pose_error(arm.forward_kinematics(test.joints, placed), test.observed))
+    return {
+        "records": "/".join(Path(str(config.transfer)).parts[-2:]),
+        "rows": {"train": train.joints.shape[1], "test": test.joints.shape[1]},
+        "test": before_and_after(*errors),
+    }

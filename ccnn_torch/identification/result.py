@@ -11,18 +11,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch.identification import Knowledge, Problem, what_is_known
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.doubts import doubts_of
-from ccnn_torch.identification.judge import commanded, map_error, noise_of_test, predicted
-from ccnn_torch.identification.measured.measured import Measured
-from ccnn_torch.identification.pose_errors import before_and_after, figures, removed
+from ccnn_torch.identification.judge import (
+    before_and_after,
+    commanded,
+    doubts_of,
+    figures,
+    map_error,
+    noise_of_test,
+    predicted,
+    removed,
+)
+from ccnn_torch.identification.measured import Measured
 from ccnn_torch.identification.problems.parameters import Selection
 from ccnn_torch.identification.solve import (
     Outcome,
-    Piece,
-    free_values,
     is_apart,
-    knowledge_of,
     pieces_of,
 )
 from ccnn_torch.mechanisms import PoseError
@@ -53,24 +58,29 @@ class Known:
     freedom: Tensor
 
 
-def known_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> Known:
-    """Put together what is known of each piece's parameters."""
-    names = [p.name for p in selection.parameters]
-    sd = torch.full((len(whole), len(names)), math.inf, dtype=torch.float64)
-    correlation = torch.full((len(names), len(names)), math.nan, dtype=torch.float64)
-    combinations: list[str] = []
-    singular: list[list[float]] = []
-    noise: list[Tensor] = []
-    freedom: list[Tensor] = []
-    for piece, knowledge in zip(pieces, knowledge_of(pieces, selection, whole), strict=True):
-        at = torch.tensor([names.index(p.name) for p in piece.problem.parameters])
-        sd[:, at] = knowledge.sd
-        correlation[at[:, None], at] = knowledge.correlation[0]
-        combinations += list(knowledge.combinations)
-        singular.append(knowledge.singular_values[0].tolist())
-        noise.append(knowledge.noise.expand(len(whole)))
-        freedom.append(knowledge.freedom.expand(len(whole)))
-    return Known(sd, combinations, correlation, singular, torch.stack(noise).mean(0), torch.stack(freedom).sum(0))
+def known_at(pieces: list[Problem], selection: Selection, whole: Tensor) -> Known:
+    """What is known of the parameters of all pieces at a geometry `r x K`."""
+    free = selection.free(whole)
+    return known_of([what_is_known(piece, free[:, selection.places(piece.parameters)]) for piece in pieces], selection)
+
+
+def known_of(found: Sequence[Knowledge], selection: Selection) -> Known:
+    """Put together what is known of pieces; unknowns behind a piece's parameters are not of the machine."""
+    k = len(selection.parameters)
+    sd = torch.full((len(found[0].sd), k), math.inf, dtype=torch.float64)
+    correlation = torch.full((k, k), math.nan, dtype=torch.float64)
+    for knowledge in found:
+        at = torch.tensor(selection.places(knowledge.parameters[:k]))
+        sd[:, at] = knowledge.sd[:, : len(at)]
+        correlation[at[:, None], at] = knowledge.correlation[0, : len(at), : len(at)]
+    return Known(
+        sd=sd,
+        combinations=[sentence for knowledge in found for sentence in knowledge.combinations],
+        correlation=correlation,
+        singular_values=[knowledge.singular_values[0].tolist() for knowledge in found],
+        noise=torch.stack([knowledge.noise for knowledge in found]).mean(0),
+        freedom=torch.stack([knowledge.freedom for knowledge in found]).sum(0),
+    )
 
 
 @dataclass(frozen=True)
@@ -98,7 +108,7 @@ def judged(config: IdentifyConfig, measured: Measured, selection: Selection, met
     machines, apart, noise = outcome.machines, is_apart(method, config), noise_of_test(measured)
     return Found(
         outcome,
-        known_of(pieces_of(measured, config, apart, machines, outcome.values), selection, outcome.values),
+        known_at(pieces_of(measured, config, apart, machines, outcome.values), selection, outcome.values),
         predicted(measured, measured.start[machines], machines),
         predicted(measured, outcome.values, machines),
         None if noise is None else part_of_error(noise, machines),
@@ -159,7 +169,7 @@ def assemble(
         "noise_ratio": figures({"value": known.noise}),
         "doubts": doubts,
         "counts": [],
-        "paper": config.paper,
+        "paper": None,
         "data_sha256": measured.data_hash or None,
         "notes": [*measured.notes, *messages, *notes],
         "versions": {
@@ -208,11 +218,11 @@ def beside_truth(
     outcome, machines = found.outcome, found.outcome.machines
     assert measured.truth is not None
     truth = measured.truth[machines]
-    gap = free_values(selection, outcome.values - truth)
+    gap = selection.free(outcome.values - truth)
     pieces = pieces_of(measured, config, found.per_leg, machines, truth)
-    bound = known_of(pieces, selection, truth).sd
+    bound = known_at(pieces, selection, truth).sd
     block: dict[str, Any] = {
-        "deviations": _deviations(selection, gap, free_values(selection, truth - measured.start[machines]))
+        "deviations": _deviations(selection, gap, selection.free(truth - measured.start[machines]))
     }
     identifiable = torch.isfinite(bound).all(0)
     if bool(identifiable.any()):
@@ -278,15 +288,13 @@ def _parameters(measured: Measured, selection: Selection, found: Found, resample
     return answer
 
 
-def residuals_of(pieces: list[Piece], selection: Selection, outcome: Outcome) -> dict[str, Tensor]:
+def residuals_of(pieces: list[Problem], selection: Selection, outcome: Outcome) -> dict[str, Tensor]:
     """Whitened residuals of the first machine at the start and at the result, `s x c` for each piece."""
-    names = [p.name for p in selection.parameters]
-    found = free_values(selection, outcome.values[:1])
+    found = selection.free(outcome.values[:1])
     arrays = {}
-    for number, piece in enumerate(pieces):
-        problem = piece.problem
-        at = [names.index(p.name) for p in problem.parameters]
+    for number, problem in enumerate(pieces):
         data = tuple(d[:1] for d in problem.data)
-        for when, values in (("before", problem.start[:1]), ("after", found[:, at])):
+        after = found[:, selection.places(problem.parameters)]
+        for when, values in (("before", problem.start[:1]), ("after", after)):
             arrays[f"residual_{when}_{number}"] = problem.residual(values[:, None], *data)[0].detach()
     return arrays

@@ -1,10 +1,13 @@
-"""One method on the rows of an identification, jointly or leg by leg, on all machines at once."""
+"""One method on the rows of an identification, jointly or leg by leg, on all machines at once; its checkpoint."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +16,6 @@ from ccnn_torch.config.prior_sizes import prior_sizes
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import (
     Fit,
-    Knowledge,
     ParameterChoice,
     Problem,
     Progress,
@@ -21,27 +23,19 @@ from ccnn_torch.identification import (
     forward_problem,
     inverse_problem,
     split_by_leg,
-    what_is_known,
 )
 from ccnn_torch.identification.config import PER_LEG, IdentifyConfig, base_method
-from ccnn_torch.identification.measured.measured import Measured, Rows
+from ccnn_torch.identification.measured import Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.problem import part_of
 from ccnn_torch.identification.solvers.registry import get_solver
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
+from ccnn_torch.training import load_checkpoint, save_checkpoint
 
 QUICK = ("lm", "tikhonov")
 """The others are global searches, which take minutes where these take a blink."""
 # The noise of a row is carried over at the start, then at what was found; a third time changes nothing that counts.
 _ROUNDS = 2
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A problem that is solved on its own: the whole, or one leg's; `leg` is None for the whole."""
-
-    problem: Problem
-    leg: int | None = None
 
 
 @dataclass(frozen=True)
@@ -79,7 +73,7 @@ def select(measured: Measured, config: IdentifyConfig) -> Selection:
 
 def pieces_of(
     measured: Measured, config: IdentifyConfig, apart: bool, machines: Tensor, near: Tensor | None = None
-) -> list[Piece]:
+) -> list[Problem]:
     """The problems that a method solves.
 
     Args:
@@ -88,16 +82,22 @@ def pieces_of(
             begins when None. Near singular poses the difference matters.
     """
     if not apart:
-        return [Piece(_problem(measured, config, measured.rows.of(machines), machines, False, near))]
+        return [_problem(measured, config, measured.rows.of(machines), machines, False, near)]
     whole = split_by_leg(_problem(measured, config, measured.rows.of(machines), machines, True, near))
-    legs = [next(p.leg for p in part.parameters if p.leg is not None) for part in whole]
     if not measured.leg_rows:
-        return [Piece(part, leg) for part, leg in zip(whole, legs, strict=True)]
+        return whole
     own = []
-    for i, leg in enumerate(legs):
-        rows = measured.leg_rows[leg].of(machines)
-        own.append(Piece(split_by_leg(_problem(measured, config, rows, machines, True, near))[i], leg))
+    for i, part in enumerate(whole):
+        rows = measured.leg_rows[leg_of(part)].of(machines)
+        own.append(split_by_leg(_problem(measured, config, rows, machines, True, near))[i])
     return own
+
+
+def leg_of(part: Problem) -> int:
+    """The leg that a part of `split_by_leg` is of."""
+    leg = part.parameters[0].leg
+    assert leg is not None
+    return leg
 
 
 def _problem(
@@ -187,8 +187,11 @@ def run_method(method: str, measured: Measured, config: IdentifyConfig, progress
         pieces = pieces_of(measured, config, is_apart(method, config), machines, values)
         fits = []
         for i, piece in enumerate(pieces):
-            fits.append(solver(piece.problem, config.seed + i, part_of(progress, i, len(pieces))))
-        values = whole_values(selection, pieces, [fit.values for fit in fits], machines)
+            fits.append(solver(piece, config.seed + i, part_of(progress, i, len(pieces))))
+        free = selection.start[machines].clone()
+        for piece, fit in zip(pieces, fits, strict=True):
+            free[:, selection.places(piece.parameters)] = fit.values
+        values = free @ selection.spread + selection.fixed[machines]
     assert values is not None
     seconds = time.perf_counter() - begun
     said = [fit.message for fit in fits if fit.message]
@@ -202,26 +205,30 @@ def run_method(method: str, measured: Measured, config: IdentifyConfig, progress
     )
 
 
-def whole_values(selection: Selection, pieces: list[Piece], values: list[Tensor], machines: Tensor) -> Tensor:
-    """The whole geometry `r x K` from the values `r x k` of each piece's free parameters."""
-    names = [p.name for p in selection.parameters]
-    free = selection.start[machines].clone()
-    for piece, found in zip(pieces, values, strict=True):
-        free[:, [names.index(p.name) for p in piece.problem.parameters]] = found
-    return free @ selection.spread + selection.fixed[machines]
+def save_outcome(path: Path, outcome: Outcome, facts: Mapping[str, Any]) -> None:
+    """Write an outcome; `facts` say what config and data it is of.
+
+    Raises:
+        WriteError: it cannot be written.
+    """
+    about = {
+        "facts": dict(facts),
+        "evaluations": outcome.evaluations,
+        "seconds": outcome.seconds,
+        "message": outcome.message,
+    }
+    tensors = {"machines": outcome.machines, "values": outcome.values, "converged": outcome.converged}
+    save_checkpoint(path, tensors, about)
 
 
-def free_values(selection: Selection, whole: Tensor) -> Tensor:
-    """Values of the free parameters, `r x k`, out of the whole geometry `r x K`."""
-    first = selection.spread.argmax(-1)
-    return whole[:, first]
-
-
-def knowledge_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> list[Knowledge]:
-    """What is known of each piece's parameters at a geometry `r x K`."""
-    names = [p.name for p in selection.parameters]
-    free = free_values(selection, whole)
-    return [
-        what_is_known(piece.problem, free[:, [names.index(p.name) for p in piece.problem.parameters]])
-        for piece in pieces
-    ]
+def load_outcome(path: Path) -> Outcome:
+    """The outcome in a file."""
+    tensors, about = load_checkpoint(path)
+    return Outcome(
+        tensors["machines"],
+        tensors["values"],
+        tensors["converged"].to(torch.bool),
+        int(about["evaluations"]),
+        float(about["seconds"]),
+        str(about["message"]),
+    )

@@ -11,21 +11,18 @@ from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.refinement import (
-    finish_refinement,
+    RefinementSettings,
+    RefinementState,
+    log_evidence,
+    part_of_problem,
     pose_refinement,
     second_order,
     start_refinement,
     step_refinement,
 )
-from ccnn_torch.evolution.refinement_state import (
-    RefinementSettings,
-    RefinementState,
-    part_of_problem,
-)
 from ccnn_torch.evolution.settings import check_least
-from ccnn_torch.learners.one_network import OneNetwork
-from ccnn_torch.learners.protocol import TrainingData
-from ccnn_torch.learners.rows import mean_square, usable_rows
+from ccnn_torch.learners.protocol import TrainingData, weighted_mse
+from ccnn_torch.learners.rows import OneNetwork, usable_rows
 from ccnn_torch.numerics.trees import picked, put
 
 _STARTS = 0
@@ -93,9 +90,8 @@ class BPLM(OneNetwork):
         """
         self._data = data = usable_rows(data)
         sizes = (data.inputs.shape[-1], *self.settings.hidden, data.targets.shape[-1])
-        leading = (len(data.seeds), self.settings.restarts)
-        shapes = list(pairwise(sizes))
-        self._masks = [data.seeds.new_ones(leading[0], 1, out, into, dtype=torch.bool) for into, out in shapes]
+        self._leading = (len(data.seeds), self.settings.restarts)
+        self._masks = [data.seeds.new_ones(len(data.seeds), 1, o, i, dtype=torch.bool) for i, o in pairwise(sizes)]
         weights = _nguyen_widrow(sizes, data.seeds, self.settings.restarts)
         self._problem = pose_refinement(
             self._masks,
@@ -107,44 +103,38 @@ class BPLM(OneNetwork):
             None if data.metric is None else data.metric.unsqueeze(1),
         )
         self._state = start_refinement(self._problem, weights)
-        self._evidence = data.inputs.new_full(leading, -torch.inf)
-        # Zeros: the mean, until some evidence is known.
-        self._best = torch.zeros_like(self._state.weights.reshape(*leading, -1)[:, 0])
-        self._best_evidence = self._evidence[:, 0].clone()
-        self._rest = torch.zeros(leading, dtype=torch.int64, device=data.inputs.device)
+        # Of each network, `r * restarts`.
+        self._evidence = torch.full_like(self._state.damping, -torch.inf)
+        self._rest = torch.zeros_like(self._state.calm)
         self._iterations = torch.zeros_like(self._evidence)
+        # Zeros: the mean, until some evidence is known.
+        self._best = torch.zeros_like(self._apart(self._state.weights)[:, 0])
+        self._best_evidence = torch.full_like(data.weights[:, 0], -torch.inf)
         self._known = second_order(self._problem, self._state)
 
     def step(self) -> dict[str, Tensor]:
         """One iteration of every network."""
         data = self._data
-        going = torch.nonzero(self._rest.flatten() < self.settings.patience).flatten()
+        going = torch.nonzero(self._rest < self.settings.patience).flatten()
         problem = part_of_problem(self._problem, going)
-        moved = step_refinement(problem, picked(self._state, going), picked(self._known, going))
+        everything = (self._state, self._known, self._evidence, self._rest, self._iterations)
+        state, known, before, rest, made = picked(everything, going)
+        moved = step_refinement(problem, state, known)
         known = second_order(problem, moved)
-        refined = finish_refinement(problem, moved, known)
-        self._state, self._known = put(self._state, going, moved), put(self._known, going, known)
-        channels = data.targets.shape[-1] if data.metric is None else data.metric.shape[-2]
-        values = (data.weights.sum(-1, keepdim=True) * channels).expand_as(self._evidence).flatten()[going]
-        evidence = refined.log_evidence.flatten() / values
-        evidence = torch.where(evidence.isfinite(), evidence, -torch.inf)
-        calm = (evidence - self._evidence.flatten()[going]).abs() <= self.settings.tolerance
-        rest = torch.where(calm, self._rest.flatten()[going] + 1, 0)
-        self._rest = self._rest.flatten().index_copy(0, going, rest).view_as(self._rest)
-        self._evidence = self._evidence.flatten().index_copy(0, going, evidence).view_as(self._evidence)
-        self._iterations = (
-            self._iterations.flatten().index_add(0, going, torch.ones_like(evidence)).view_as(self._evidence)
-        )
-        highest, which = self._evidence.max(-1)
+        evidence = log_evidence(problem, moved, known) / (problem.rows.sum(-1) * moved.noise.shape[-1])
+        calm = (evidence - before).abs() <= self.settings.tolerance
+        renewed = (moved, known, evidence, torch.where(calm, rest + 1, 0), made + 1)
+        self._state, self._known, self._evidence, self._rest, self._iterations = put(everything, going, renewed)
+        highest, which = self._apart(self._evidence).max(-1)
         repeats = torch.arange(len(which), device=which.device)
-        candidate = self._state.weights.reshape(*self._evidence.shape, -1)[repeats, which]
+        candidate = self._apart(self._state.weights)[repeats, which]
         better = highest > self._best_evidence
         self._best = torch.where(better.unsqueeze(-1), candidate, self._best)
         self._best_evidence = torch.where(better, highest, self._best_evidence)
         return {
-            "error_train": mean_square(self.predict(data.inputs) - data.targets, data.weights),
+            "error_train": weighted_mse(self.predict(data.inputs), data.targets, data.weights),
             "evidence_best": highest,
-            "evaluations": self._iterations.sum(-1) * (data.targets.shape[-1] + 1),
+            "evaluations": self._apart(self._iterations).sum(-1) * (data.targets.shape[-1] + 1),
         }
 
     @property
@@ -156,8 +146,8 @@ class BPLM(OneNetwork):
     @property
     def converged(self) -> Tensor:
         """Whether the network of highest evidence is at rest, `r`, bool."""
-        best = self._evidence.argmax(-1, keepdim=True)
-        at_rest: Tensor = self._rest.gather(-1, best).squeeze(-1) >= self.settings.patience
+        best = self._apart(self._evidence).argmax(-1, keepdim=True)
+        at_rest: Tensor = self._apart(self._rest).gather(-1, best).squeeze(-1) >= self.settings.patience
         return at_rest
 
     @property
@@ -167,24 +157,24 @@ class BPLM(OneNetwork):
 
     def state_dict(self) -> dict[str, Tensor]:
         """The networks with their precisions, `r x restarts x ...`, and what is known of each."""
-        leading = self._evidence.shape
-        tensors = {
-            name: value.reshape(*leading, *value.shape[1:]) if value.dim() else value
-            for name, value in self._state.state_dict().items()
-        }
         known = {"log_evidence": self._evidence, "rest": self._rest, "iterations_made": self._iterations}
-        return tensors | known | {"best": self._best, "best_evidence": self._best_evidence}
+        tensors = {
+            name: self._apart(value) if value.dim() else value
+            for name, value in (self._state.state_dict() | known).items()
+        }
+        return tensors | {"best": self._best, "best_evidence": self._best_evidence}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back a state; call `start` with the same data first."""
-        self._evidence, self._rest = state["log_evidence"], state["rest"]
-        self._iterations = state["iterations_made"]
         self._best, self._best_evidence = state["best"], state["best_evidence"]
-        names = self._state.state_dict().keys()
-        self._state = RefinementState.from_state_dict(
-            {name: state[name].flatten(0, 1) if state[name].dim() else state[name] for name in names}
-        )
+        flat = {name: value.flatten(0, 1) if value.dim() > 1 else value for name, value in state.items()}
+        self._state = RefinementState.from_state_dict(flat)
+        self._evidence, self._rest, self._iterations = (flat[k] for k in ("log_evidence", "rest", "iterations_made"))
         self._known = second_order(self._problem, self._state)
+
+    def _apart(self, value: Tensor) -> Tensor:
+        """By repeat and restart, `r x restarts x ...`."""
+        return value.reshape(*self._leading, *value.shape[1:])
 
     def _model(self) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of the model, `r x 1 x ...`."""

@@ -8,19 +8,16 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.bundle import averaged, without_waves
-from ccnn_torch.evolution.coevolution import REPRESENTATIVES, density, diversity
-from ccnn_torch.evolution.evaluation import EPSILON, make_task
-from ccnn_torch.evolution.harmonics import Harmonics, fit_harmonics, harmonic_count
-from ccnn_torch.evolution.masked_network import MaskedNetwork
-from ccnn_torch.evolution.network import forward
+from ccnn_torch.evolution.coevolution import EPSILON, REPRESENTATIVES, density, diversity, make_task
+from ccnn_torch.evolution.masked_network import MaskedNetwork, Spread, readout_spread, spread_variance
+from ccnn_torch.evolution.network import averaged, forward, without_waves
 from ccnn_torch.evolution.random import member_seeds
 from ccnn_torch.evolution.settings import CCNNSettings
-from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
-from ccnn_torch.evolution.waves import Waves
-from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.evolution.waves import Harmonics, Waves, fit_harmonics, harmonic_count
+from ccnn_torch.learners.protocol import TrainingData, weighted_mse
 from ccnn_torch.learners.rows import thinned
 from ccnn_torch.learners.structure import MemberRows, Structure
+from ccnn_torch.numerics.trees import below
 
 # A training with rows held out, which chooses the number of steps, has one in so many of a refinement's iterations; the
 # one on all rows goes on from its networks with the others.
@@ -184,7 +181,7 @@ class CCNN:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back a state; call `start` with the same data first."""
         for number, structure in enumerate(self._structures):
-            structure.load(_of_structure(state, number), int(state["generation"]))
+            structure.load(below(state, f"structure_{number}_"), int(state["generation"]))
         self._phase = int(state["phase"])
 
     @property
@@ -195,7 +192,7 @@ class CCNN:
     def begin_from(self, state: dict[str, Tensor]) -> None:
         """Refine the networks of this state, found on fewer of the same rows in the same scaling; after `start`."""
         most, kept = self.settings.refinement_iterations, self.settings.kept
-        parts = [_of_structure(state, number) for number in range(len(self._structures))]
+        parts = [below(state, f"structure_{number}_") for number in range(len(self._structures))]
         evidence = [part["evidence"].sort(1, descending=True).values[:, :kept].mean(1) for part in parts]
         # Only the structure that each repeat took: a few rows more do not turn the evidence.
         taken = torch.stack(evidence).argmax(0)
@@ -261,14 +258,8 @@ class CCNN:
         """Weighted mean squared error of the model on the training rows, `r`."""
         data = self._data
         there = (data.weights > 0).unsqueeze(-1)
-        error = self._remainder(data.inputs.masked_fill(~there, 0)) - data.targets
-        squares = error.masked_fill(~there, 0).square().mean(-1)
-        return (squares * data.weights).sum(-1) / data.weights.sum(-1)
-
-
-def _of_structure(state: dict[str, Tensor], number: int) -> dict[str, Tensor]:
-    prefix = f"structure_{number}_"
-    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+        found = self._remainder(data.inputs.masked_fill(~there, 0)).masked_fill(~there, 0)
+        return weighted_mse(found, data.targets.masked_fill(~there, 0), data.weights)
 
 
 def _gears(data: TrainingData, settings: CCNNSettings) -> Harmonics | None:

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.learners.protocol import TrainingData
-from ccnn_torch.learners.rows import mean_square, usable_rows
+from ccnn_torch.learners.protocol import TrainingData, weighted_mse
+from ccnn_torch.learners.rows import usable_rows
 
 _SMALLEST_VARIANCE = 1e-12
 
@@ -68,7 +68,7 @@ class Constant:
         weights = self._data.weights.unsqueeze(-1)
         self._value = (self._data.targets * weights).sum(1) / weights.sum(1)
         self._step = self._step + 1
-        error = mean_square(self._data.targets - self._value.unsqueeze(1), self._data.weights)
+        error = weighted_mse(self._data.targets, self._value.unsqueeze(1), self._data.weights)
         return {"error_train": error, "evaluations": torch.ones_like(error)}
 
     @property

@@ -7,22 +7,22 @@ import itertools
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.breeding import (
+from ccnn_torch.evolution.coevolution import EPSILON, density, diversity, fitness, make_task, network_errors
+from ccnn_torch.evolution.genome import (
     BreedingDraws,
     breed_networks,
     breeding_shapes,
+    genomes_of,
     initial_population,
+    named_genomes,
+    select,
     with_elites,
 )
-from ccnn_torch.evolution.coevolution import density, diversity
-from ccnn_torch.evolution.evaluation import EPSILON, fitness, make_task, network_errors
-from ccnn_torch.evolution.genome import Genome, select
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import ENNSettings
-from ccnn_torch.learners.one_network import OneNetwork
-from ccnn_torch.learners.protocol import TrainingData
-from ccnn_torch.learners.rows import mean_square, usable_rows
-from ccnn_torch.numerics.trees import chosen, mapped
+from ccnn_torch.learners.protocol import TrainingData, weighted_mse
+from ccnn_torch.learners.rows import OneNetwork, usable_rows
+from ccnn_torch.numerics.trees import below, chosen, mapped
 
 # Streams of random numbers: one for the generations, one for each layer's first individuals.
 _GENERATIONS, _FIRST = 0, 1
@@ -80,7 +80,7 @@ class ENN(OneNetwork):
         return {
             "fitness_best": self._best_fitness,
             "fitness_mean": self._fitness.mean(-1),
-            "error_train": mean_square(self.predict(data.inputs) - data.targets, data.weights),
+            "error_train": weighted_mse(self.predict(data.inputs), data.targets, data.weights),
             "density": density(self._layers),
             "diversity": diversity(self._layers, settings.weight_range),
             "evaluations": torch.full_like(self._best_fitness, judged),
@@ -102,19 +102,12 @@ class ENN(OneNetwork):
     def state_dict(self) -> dict[str, Tensor]:
         """The population with its fitness, and the fittest network so far."""
         tensors = {"fitness": self._fitness, "best_fitness": self._best_fitness}
-        for name, layers in (("population", self._layers), ("best", self._best)):
-            for number, layer in enumerate(layers):
-                tensors[f"{name}_mask_{number}"] = layer.mask
-                tensors[f"{name}_weight_{number}"] = layer.weight
+        tensors |= named_genomes("population_", self._layers) | named_genomes("best_", self._best)
         return tensors | {"generation": torch.tensor(self._generation, dtype=torch.int64)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back a state; call `start` with the same data first."""
-
-        def layers(name: str) -> list[Genome]:
-            return [Genome(state[f"{name}_mask_{n}"], state[f"{name}_weight_{n}"]) for n in range(len(self._layers))]
-
-        self._layers, self._best = layers("population"), layers("best")
+        self._layers, self._best = (genomes_of(below(state, prefix)) for prefix in ("population_", "best_"))
         self._fitness, self._best_fitness = state["fitness"], state["best_fitness"]
         self._generation = int(state["generation"])
 

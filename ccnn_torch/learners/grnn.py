@@ -11,13 +11,18 @@ from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.settings import check_least
-from ccnn_torch.learners.grnn_network import GRNNNetwork, KernelVariance
-from ccnn_torch.learners.kernel import FARTHEST, blocked_means
-from ccnn_torch.learners.protocol import TrainingData
-from ccnn_torch.learners.rows import mean_square, usable_rows
+from ccnn_torch.learners.grnn_network import FARTHEST, GRNNNetwork, KernelVariance, blocked_means
+from ccnn_torch.learners.protocol import TrainingData, weighted_mse
+from ccnn_torch.learners.rows import usable_rows
 
 # Streams of random numbers: which rows are judged, and the moves of each step.
 _ROWS, _MOVES = 0, 1
+# The search has converged once the factor of a move is below this: leave-one-out is flat at its lowest.
+_SMALLEST_MOVE = 1.05
+# Standard errors by which the best bandwidths must beat the mean of all rows, row by row in leave-one-out, to be used
+# at all. The lowest of many errors is low by luck too: with nothing to learn in 100 rows, 0 costs 2 % of the variance
+# and 1.5 a tenth of that, while on case one the gain is 3.5 to 6.
+_CAUTION = 1.5
 
 
 @dataclass(frozen=True)
@@ -31,10 +36,6 @@ class GRNNSettings:
         narrowest, widest: bandwidths of the first step go from the one to the other, geometrically, besides an
             infinite one, which is the mean; features are in -1 .. 1.
         move: factor by which a bandwidth first moves; its root is taken each time that no move was better.
-        smallest_move: the search has converged once the factor is below this: leave-one-out is flat at its lowest.
-        caution: standard errors by which the best bandwidths must beat the mean of all rows, row by row in
-            leave-one-out, to be used at all. The lowest of many errors is low by luck too: with nothing to learn in 100
-            rows, 0 costs 2 % of the variance and 1.5 a tenth of that, while on case one the gain is 3.5 to 6.
         queries: rows that leave-one-out judges, drawn once by seed where there are more. Bandwidth vectors are
             compared on the same rows, so that 500 distinguish them as well as all would.
         references: rows that they are predicted from, drawn likewise; the bandwidths are then narrowed by
@@ -49,8 +50,6 @@ class GRNNSettings:
     narrowest: float = 0.02
     widest: float = 5.0
     move: float = 2.0
-    smallest_move: float = 1.05
-    caution: float = 1.5
     queries: int = 500
     references: int = 2000
 
@@ -60,11 +59,8 @@ class GRNNSettings:
             raise ValueError(f"narrowest={self.narrowest} must be above 0 and below widest={self.widest}")
         if self.references < self.queries:
             raise ValueError(f"references={self.references} must be at least queries={self.queries}")
-        if not 0 <= self.caution < math.inf:
-            raise ValueError(f"caution={self.caution} must not be negative")
-        for key in ("move", "smallest_move"):
-            if not 1 < getattr(self, key) < math.inf:
-                raise ValueError(f"{key}={getattr(self, key)} is a factor: write a number above 1")
+        if not 1 < self.move < math.inf:
+            raise ValueError(f"move={self.move} is a factor: write a number above 1")
 
 
 class _Judged(NamedTuple):
@@ -89,7 +85,7 @@ class GRNN:
     """Kernel regression with one bandwidth per input, shared by the outputs; a step judges a batch of bandwidths.
 
     The criterion is the mean squared leave-one-out error, in the channels of `data.metric` where there is one; the
-    model has the bandwidths of the lowest so far, or is the mean where they are no better by `caution`. Moves of
+    model has the bandwidths of the lowest so far, or is the mean where they are no better by chance. Moves of
     a step: each bandwidth up, down, and switched off or on; and random moves of several at once. Everything is exact
     up to `references` rows, and computed in blocks of a few megabytes beyond.
 
@@ -152,7 +148,7 @@ class GRNN:
     @property
     def converged(self) -> Tensor:
         """Whether no move of the smallest size was better, `r`, bool."""
-        return self._move < self.settings.smallest_move
+        return self._move < _SMALLEST_MOVE
 
     @property
     def steps(self) -> int:
@@ -275,16 +271,15 @@ class GRNN:
         mean = self._mean_of_rows(gain)
         variance = self._mean_of_rows((gain - mean.unsqueeze(-1)).square())
         count = self._judged.weights[:, : self._judged.queries].sum(-1)
-        return mean > self.settings.caution * (variance / count).sqrt()
+        return mean > _CAUTION * (variance / count).sqrt()
 
     def _training_error(self) -> Tensor:
         """Mean squared error of the model on all training rows, or on the judged ones where there are more; `r`."""
         judged, rows = self._judged, self._data
         if rows.weights.shape[1] <= self.settings.references:
-            return mean_square(self.predict(rows.inputs) - rows.targets, rows.weights)
+            return weighted_mse(self.predict(rows.inputs), rows.targets, rows.weights)
         here = slice(0, judged.queries)
-        error = self.predict(judged.inputs[:, here]) - judged.targets[:, here]
-        return mean_square(error, judged.weights[:, here])
+        return weighted_mse(self.predict(judged.inputs[:, here]), judged.targets[:, here], judged.weights[:, here])
 
     def _narrowed(self, inverse: Tensor) -> Tensor:
         """1 / h for the use of all rows, `r x i`: bandwidths shrink as rows ** (-1 / (4 + inputs that are on))."""

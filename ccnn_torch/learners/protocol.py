@@ -105,6 +105,12 @@ class Learner(Protocol):
         """
 
 
+def weighted_mse(predicted: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
+    """Mean squared error over rows and outputs. predicted, targets: `r x s x o`; weights: `r x s`; returns `r`."""
+    per_row = (predicted - targets).square().mean(-1)
+    return (per_row * weights).sum(-1) / weights.sum(-1)
+
+
 _VERBS = ("start", "step", "finished", "steps", "predict", "state_dict", "load_state_dict", "network")
 
 

@@ -8,18 +8,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.bundle import Bundle, averaged, resized, without_waves
-from ccnn_torch.evolution.coevolution import Coevolution, advance, keep_refined, start
-from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
-from ccnn_torch.evolution.genome import Genome
-from ccnn_torch.evolution.network import forward
-from ccnn_torch.evolution.priors import prior_groups, resized_prior
-from ccnn_torch.evolution.refinement import refine
-from ccnn_torch.evolution.refinement_state import Precisions, RefinementSettings
+from ccnn_torch.evolution.coevolution import Coevolution, Task, advance, fitness, joined_errors, keep_refined, start
+from ccnn_torch.evolution.gauss_newton import prior_groups, resized_prior
+from ccnn_torch.evolution.genome import Genome, genomes_of, named_genomes
+from ccnn_torch.evolution.network import Bundle, averaged, forward, resized, without_waves
+from ccnn_torch.evolution.refinement import Precisions, RefinementSettings, refine
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves
 from ccnn_torch.numerics.blocks import blocks
-from ccnn_torch.numerics.trees import chosen, joined, picked, put
+from ccnn_torch.numerics.trees import below, chosen, joined, picked, put
 
 # Passes of one search: after each, what was found before is fitted anew.
 _PASSES = 2
@@ -200,9 +197,7 @@ class Structure:
         """Everything that changes, `r x members x ...`, but for the generation."""
         state = self.state
         named = {"best_fitness": state.best_fitness, "evidence": self.evidence, "passes": self.passes}
-        for name, parts in (("population", state.populations), ("best", state.best)):
-            for layer, part in enumerate(parts):
-                named[f"{name}_mask_{layer}"], named[f"{name}_weight_{layer}"] = part.mask, part.weight
+        named |= named_genomes("population_", state.populations) | named_genomes("best_", state.best)
         named |= {f"fitness_{layer}": scores for layer, scores in enumerate(state.fitness)}
         named |= {f"refined_{name}": tensor for name, tensor in self.refined.tensors.items()}
         named |= {f"precision_{name}": tensor for name, tensor in self.precisions._asdict().items()}
@@ -211,15 +206,10 @@ class Structure:
     def load(self, tensors: dict[str, Tensor], generation: int) -> None:
         """Take back what `tensors` gave."""
         flat = {name: tensor.flatten(0, 1) for name, tensor in tensors.items()}
-        layers = range(len(self.state.populations))
-
-        def parts(name: str) -> tuple[Genome, ...]:
-            return tuple(Genome(flat[f"{name}_mask_{n}"], flat[f"{name}_weight_{n}"]) for n in layers)
-
         self.state = Coevolution(
-            populations=parts("population"),
-            fitness=tuple(flat[f"fitness_{n}"] for n in layers),
-            best=parts("best"),
+            populations=tuple(genomes_of(below(flat, "population_"))),
+            fitness=tuple(flat[f"fitness_{n}"] for n in range(len(self.state.fitness))),
+            best=tuple(genomes_of(below(flat, "best_"))),
             best_fitness=flat["best_fitness"],
             generation=generation,
         )
@@ -281,8 +271,5 @@ class Structure:
 def _refined(tensors: dict[str, Tensor]) -> tuple[Bundle, Precisions, Tensor]:
     """Refined networks, their precisions and evidence from `Structure.tensors`, the repeats and members in one."""
     flat = {name: tensor.flatten(0, 1) for name, tensor in tensors.items()}
-    prefix = "refined_"
-    bundle = Bundle.from_tensors(
-        {name.removeprefix(prefix): tensor for name, tensor in flat.items() if name.startswith(prefix)}
-    )
-    return bundle, Precisions(*(flat[f"precision_{name}"] for name in Precisions._fields)), flat["evidence"]
+    bundle = Bundle.from_tensors(below(flat, "refined_"))
+    return bundle, Precisions(**below(flat, "precision_")), flat["evidence"]

@@ -89,8 +89,12 @@ class Mechanism(nn.Module):
         high: Sequence[float],
         home_pose: Sequence[float] | None = None,
         home_joints: Sequence[float] | None = None,
+        keys: Mapping[str, Any] | None = None,
     ) -> None:
-        """Name the parts; `home_pose` defaults to the middle of the box, `home_joints` to its inverse (from zeros)."""
+        """Name the parts; `home_pose` defaults to the middle of the box, `home_joints` to its inverse (from zeros).
+
+        keys: of a machine of this package, whose name is also its spec.
+        """
         super().__init__()
         if not any(self._defines(verb) for verb in ("closure", "solve_inverse", "forward_kinematics")):
             raise InputError(
@@ -109,8 +113,9 @@ class Mechanism(nn.Module):
         self.register_buffer("home_joints", torch.zeros(len(self.joints), dtype=torch.float64))
         self.home_joints.copy_(self.solve_inverse(self.home_pose) if home_joints is None else _tensor(home_joints))
         self.inverse_kinematics = InverseKinematics(self.solve_inverse)
-        # How to build it again: `spec` and `keys` of `load_mechanism`, which fills this in.
-        self.recipe: dict[str, Any] = {}
+        # How to build it again: `spec` and `keys` of `load_mechanism`, which fills this in for a user's class.
+        own = type(self).__module__.startswith("ccnn_torch.mechanisms.machines.")
+        self.recipe: dict[str, Any] = {"spec": name, "keys": dict(keys or {})} if own else {}
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -316,24 +321,6 @@ class Mechanism(nn.Module):
         ratio = values[..., 0] / values[..., -1]
         return torch.where(torch.isfinite(ratio), ratio, torch.inf)
 
-    def singularity(
-        self,
-        joints: Tensor,
-        rotation_weight: float = 0.04,
-        parameters: Tensor | None = None,
-        guess: Tensor | None = None,
-    ) -> Tensor:
-        """How far from a singularity: 1 where all directions are alike, 0 at a singularity; `...` [1].
-
-        With the loop closure F(X, q) = 0 the Jacobian is J = -(∂F/∂X)⁻¹ ∂F/∂q. Where ∂F/∂q is singular (first kind:
-        a leg stretched or folded, a serial arm's singularity) the smallest singular value of J goes to 0; where ∂F/∂X
-        is (second kind: the platform can move with the joints held) the largest goes to infinity (Gosselin and Angeles
-        1990). The measure is their ratio, the reciprocal condition number of J with its rotation rows times
-        `rotation_weight` [m/rad]. Unlike determinants of the two matrices it does not depend on how F is written.
-        `singular_values` tells which kind is near.
-        """
-        return 1 / self.condition_number(joints, rotation_weight, parameters, guess)
-
     def singular_values(
         self,
         joints: Tensor,
@@ -343,8 +330,10 @@ class Mechanism(nn.Module):
     ) -> Tensor:
         """Singular values of the Jacobian with its rotation rows times `rotation_weight`, largest first [m per joint].
 
-        The last is how little the platform moves when the joints do: 0 at a singularity of the first kind. The first is
-        how much: infinite at one of the second kind.
+        With the loop closure F(X, q) = 0 the Jacobian is J = -(∂F/∂X)⁻¹ ∂F/∂q. The last is how little the platform
+        moves when the joints do: 0 where ∂F/∂q is singular (first kind: a leg stretched or folded, a serial arm's
+        singularity). The first is how much: infinite where ∂F/∂X is (second kind: the platform can move with the joints
+        held; Gosselin and Angeles 1990).
 
         Returns:
             `... x n` (or fewer, as many as the Jacobian has rows); NaN where the joints have no pose.
@@ -370,14 +359,8 @@ class Mechanism(nn.Module):
         Raises:
             InputError: fewer than one pose in a hundred of the box is reachable.
         """
-        found: list[Tensor] = []
-        for _ in range(100):
-            draw = torch.rand(count, len(self.pose), generator=generator, dtype=torch.float64)
-            pose = self.low + (self.high - self.low) * draw
-            found.append(pose[self.reachable(pose)])
-            if sum(map(len, found)) >= count:
-                return torch.cat(found)[:count]
-        raise InputError(f"mechanism '{self.name}' reaches hardly any pose of its sampling box; check low and high")
+        wrong = f"mechanism '{self.name}' reaches hardly any pose of its sampling box; check low and high"
+        return drawn_within(self.low, self.high, count, generator, self.reachable, wrong)
 
     def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:
         """Joints of sampled poses, `count x n` [SI]."""
@@ -432,6 +415,19 @@ class Mechanism(nn.Module):
             raise InputError(f"mechanism '{self.name}' has the parameters {', '.join(names)}; check {', '.join(wrong)}")
         self.nominal.copy_(_tensor([float(values[n]) for n in names]))
         self._follow_nominal()
+
+
+def drawn_within(
+    low: Tensor, high: Tensor, count: int, generator: torch.Generator, good: Callable[[Tensor], Tensor], wrong: str
+) -> Tensor:
+    """Points uniform in a box that are good (`s x d` to `s` bool), `count x d`; `wrong` where hardly any is."""
+    found: list[Tensor] = []
+    for _ in range(100):
+        points = low + (high - low) * torch.rand(count, len(low), generator=generator, dtype=torch.float64)
+        found.append(points[good(points)])
+        if sum(map(len, found)) >= count:
+            return torch.cat(found)[:count]
+    raise InputError(wrong)
 
 
 def _without_guess(verb: Callable[[Any, Tensor, Tensor | None], Tensor]) -> Callable[..., Tensor]:

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.files.dh_file import read_dh_file, read_urdf
-from ccnn_torch.mechanisms.files.mechanism_file import MechanismFile, read_mechanism_file
+from ccnn_torch.mechanisms.dh_file import read_dh_file, read_urdf
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.frames.partial import Partial
 from ccnn_torch.mechanisms.machines.delta import Delta, DeltaLinear
@@ -24,6 +23,7 @@ from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.machines.sliders import MachineTool, Tripod
 from ccnn_torch.mechanisms.machines.stewart import Stewart
 from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
 from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 from ccnn_torch.plugins import class_hint, code_refused, file_that_names, is_plugin, load_plugin, users_code

@@ -1,4 +1,4 @@
-"""Tensors in tuples, lists and dataclasses, all at once: picked, put, chosen and joined by their leading dimension.
+"""Tensors in tuples, lists, dicts and dataclasses, all at once: picked, put, chosen, joined by their leading dimension.
 
 A counter, a tensor without dimensions, belongs to all: it is neither picked from nor put into.
 """
@@ -25,6 +25,8 @@ def mapped(function: Callable[..., Tensor], tree: _Tree, *others: _Tree) -> _Tre
         if isinstance(first, list | tuple):
             values = [made(*own) for own in zip(*parts, strict=True)]
             return type(first)(*values) if hasattr(first, "_fields") else type(first)(values)
+        if isinstance(first, dict):
+            return {name: made(*(part[name] for part in parts)) for name in first}
         if dataclasses.is_dataclass(first) and not isinstance(first, type):
             names = [f.name for f in dataclasses.fields(first)]
             return type(first)(**{name: made(*(getattr(part, name) for part in parts)) for name in names})
@@ -58,3 +60,8 @@ def chosen(first: Tensor, one: _Tree, other: _Tree) -> _Tree:
 def joined(trees: Sequence[_Tree], dim: int = 0) -> _Tree:
     """All tensors concatenated."""
     return mapped(lambda *parts: torch.cat(parts, dim), *trees)
+
+
+def below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Those whose name has the prefix, by the rest of it."""
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

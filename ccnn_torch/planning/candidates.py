@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.identifiability.combinations import combinations_in_words
+from ccnn_torch.identification.identifiability import combinations_in_words
 from ccnn_torch.identification.problems.problem import Problem, Progress
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.least_squares import jacobian_of

@@ -9,11 +9,9 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.forward import forward_problem
-from ccnn_torch.identification.problems.inverse import Noise, inverse_problem
 from ccnn_torch.identification.problems.parameters import ParameterChoice, select_parameters
-from ccnn_torch.identification.problems.problem import Problem, Progress
-from ccnn_torch.identification.solvers.legs import split_by_leg
+from ccnn_torch.identification.problems.poses import Noise, forward_problem, inverse_problem
+from ccnn_torch.identification.problems.problem import Problem, Progress, split_by_leg
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.planning.candidates import (
     Candidates,

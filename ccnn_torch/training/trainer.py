@@ -2,21 +2,120 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import signal
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, Protocol
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
 from ccnn_torch.errors import InputError, MethodFailedError
-from ccnn_torch.learners.protocol import Learner, TrainingData
-from ccnn_torch.training.callbacks import Callback
-from ccnn_torch.training.checkpoint import load_checkpoint, save_checkpoint, tensor_digest
-from ccnn_torch.training.interrupt import interrupts_held_back
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.learners.protocol import Learner, TrainingData, weighted_mse
+from ccnn_torch.numerics.trees import below, chosen
+
+
+class Callback(Protocol):
+    """Called by `train` in the order given; may add metrics for those after it, must not change the learner."""
+
+    def on_start(self, learner: Learner, data: TrainingData, step: int) -> None:
+        """step: steps already done, more than 0 when a training was resumed."""
+
+    def on_step(self, step: int, metrics: dict[str, Tensor]) -> None:
+        """step: 1 for the first; metrics by name, each `r` or `r x k`."""
+
+    def on_end(self) -> None:
+        """After the last step, also when the training was interrupted."""
+
+
+def tensor_digest(tensors: dict[str, Tensor]) -> str:
+    """SHA-256 over names, types, shapes and bytes; safetensors itself does not notice a flipped byte."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name}|{tensor.dtype}|{tuple(tensor.shape)}|".encode())
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def save_checkpoint(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
+    """Write tensors (any device) and JSON-able facts about them, all under one hash.
+
+    Raises:
+        WriteError: it cannot be written; an older one is as it was.
+    """
+    held = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    facts = json.dumps({"about": about, "sha256": _seal(held, about)}, sort_keys=True)
+    write_whole(path, save(held, metadata={"ccnn_torch": facts}))
+
+
+def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `save_checkpoint` wrote.
+
+    Raises:
+        InputError: the file is damaged or is not a checkpoint of this package.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, OSError) as problem:
+        raise InputError(
+            f"{path}: this checkpoint cannot be read ({problem}); delete it and resume, which starts its phase again"
+        ) from None
+    try:
+        facts = json.loads(metadata["ccnn_torch"])
+        about: dict[str, Any] = facts["about"]
+        whole = isinstance(about, dict) and facts["sha256"] == _seal(tensors, about)
+    except (KeyError, TypeError, ValueError, RecursionError):
+        whole = False
+    if not whole:
+        raise InputError(
+            f"{path}: this checkpoint was altered after it was written; delete it and resume, "
+            "which starts its phase again"
+        )
+    return tensors, about
+
+
+def _seal(tensors: dict[str, Tensor], about: dict[str, Any]) -> str:
+    """SHA-256 over the tensors and their metadata."""
+    return hashlib.sha256((tensor_digest(tensors) + json.dumps(about, sort_keys=True)).encode()).hexdigest()
+
+
+@contextmanager
+def interrupts_held_back() -> Iterator[None]:
+    """Within it an interrupt (SIGINT) waits; it acts once the block is left, as if it had come then.
+
+    A KeyboardInterrupt inside TensorBoard's queue leaves its lock taken, and closing the writer then waits for ever
+    (about one interrupt in a hundred that falls into a write); one inside a finalizer is dropped by Python. Only the
+    main thread gets signals, so that elsewhere, or where a program has a handler of its own, nothing is changed.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    came: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if came:
+            raise KeyboardInterrupt
 
 
 @dataclass
@@ -43,12 +142,6 @@ class Training:
     clock: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     converged: Tensor | None = None
     ended: bool = True
-
-
-def weighted_mse(predicted: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
-    """Mean squared error over rows and outputs. predicted, targets: `r x s x o`; weights: `r x s`; returns `r`."""
-    per_row = (predicted - targets).square().mean(-1)
-    return (per_row * weights).sum(-1) / weights.sum(-1)
 
 
 def train(
@@ -231,12 +324,12 @@ class _Run:
                 )
         device = self.data.inputs.device
         tensors = {name: value.to(device) for name, value in tensors.items()}
-        self.learner.load_state_dict(_part(tensors, "state."))
+        self.learner.load_state_dict(below(tensors, "state."))
         self.best_step, self.best_validation = tensors["best_step"], tensors["best_validation"]
         if self.chooses:
-            self.kept = _part(tensors, "kept.")
+            self.kept = below(tensors, "kept.")
         self.step, self.seconds, self.clock = int(about["step"]), float(about["seconds"]), list(about["clock"])
-        history = _part(tensors, "history.")
+        history = below(tensors, "history.")
         self.history = [{name: value[i] for name, value in history.items()} for i in range(self.step)]
 
     def _identity(self) -> dict[str, Any]:
@@ -252,13 +345,7 @@ class _Run:
         return {name: value.detach().clone() for name, value in self.learner.state_dict().items()}
 
     def _keep(self, improved: Tensor) -> None:
-        state = self.learner.state_dict()
-        for name, value in state.items():
-            if value.dim() == 0:
-                self.kept[name] = value.clone()
-            else:
-                chosen = improved.view(-1, *([1] * (value.dim() - 1)))
-                self.kept[name] = torch.where(chosen, value, self.kept[name])
+        self.kept = chosen(improved, self._copy_state(), self.kept)
         self.best_step = torch.where(improved, torch.full_like(self.best_step, self.step), self.best_step)
 
 
@@ -269,7 +356,7 @@ def past_of(path: Path) -> tuple[dict[str, Tensor], Tensor]:
         InputError: the checkpoint is damaged.
     """
     tensors, about = load_checkpoint(path)
-    return _part(tensors, "history."), torch.tensor(about["clock"], dtype=torch.float64)
+    return below(tensors, "history."), torch.tensor(about["clock"], dtype=torch.float64)
 
 
 @contextmanager
@@ -281,10 +368,6 @@ def _told(learner: Learner, when: str) -> Iterator[None]:
         # Its first line is the reason; the others are for callers of the routine.
         sentence = str(problem).splitlines()[0].removeprefix("linalg.")
         raise MethodFailedError(f"{learner.name} met a matrix that cannot be factorised {when} ({sentence})") from None
-
-
-def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def _stack(history: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -21,9 +21,8 @@ from ccnn_torch.compensation import (
     geometric_deviation,
 )
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.evolution.harmonics import Harmonics
 from ccnn_torch.evolution.masked_network import MaskedNetwork
-from ccnn_torch.evolution.waves import Waves
+from ccnn_torch.evolution.waves import Harmonics, Waves
 from ccnn_torch.learners import TrainingData
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.training import Scaling, train

@@ -14,7 +14,7 @@ from stand_ins import fields, tripod_compensator
 from ccnn_torch.compensation import load_compensation, load_model, save_model
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism, mechanism_from_description
-from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text
+from ccnn_torch.mechanisms.mechanism_file import mechanism_text
 from ccnn_torch.records import read_table, write_table
 
 Cli = Callable[..., tuple[int, str, str]]

@@ -16,7 +16,7 @@ from stand_ins import tripod_joints
 from ccnn_torch.compensation import load_compensation, load_model, new_key_pair, sign_model
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text
+from ccnn_torch.mechanisms.mechanism_file import mechanism_text
 from ccnn_torch.records import write_table
 from ccnn_torch.verification.promise import promise_of
 

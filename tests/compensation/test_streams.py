@@ -23,7 +23,7 @@ from ccnn_torch.compensation.model_files.identified import load_geometry
 from ccnn_torch.compensation.wanted_poses import WantedPoses
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
-from ccnn_torch.mechanisms.files.write_arm import write_machine
+from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.records.read_table import read_parts
 from ccnn_torch.units import from_si

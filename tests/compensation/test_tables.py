@@ -22,7 +22,7 @@ from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
-from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text
+from ccnn_torch.mechanisms.mechanism_file import mechanism_text
 from ccnn_torch.training import Scaling
 
 Cli = Callable[..., tuple[int, str, str]]

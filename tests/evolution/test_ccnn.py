@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution import Coevolution, forward
-from ccnn_torch.evolution.evaluation import EPSILON, fitness, joined_errors
+from ccnn_torch.evolution.coevolution import EPSILON, fitness, joined_errors
 from ccnn_torch.evolution.genome import active
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import TrainingData

@@ -9,9 +9,15 @@ import torch
 from naive_network import output, random_layers
 from torch import Tensor
 
-from ccnn_torch.evolution.breeding import BreedingDraws, breed_networks, breeding_shapes, initial_population
-from ccnn_torch.evolution.evaluation import EPSILON, make_task, network_errors
-from ccnn_torch.evolution.genome import Genome, active
+from ccnn_torch.evolution.coevolution import EPSILON, make_task, network_errors
+from ccnn_torch.evolution.genome import (
+    BreedingDraws,
+    Genome,
+    active,
+    breed_networks,
+    breeding_shapes,
+    initial_population,
+)
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import ENNSettings
 from ccnn_torch.learners import TrainingData

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from ccnn_torch.evolution.evaluation import fitness, joined_errors, make_task
+from ccnn_torch.evolution.coevolution import fitness, joined_errors, make_task
 
 REPEATS, INDIVIDUALS, SETS, ROWS = 2, 3, 2, 4
 

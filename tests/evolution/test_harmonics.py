@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 from evolution.test_waves import QUICK, noise_like, uniform_rows
 
-from ccnn_torch.evolution.harmonics import fit_harmonics, harmonic_count
 from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.evolution.waves import fit_harmonics, harmonic_count
 from ccnn_torch.learners import TrainingData
 from ccnn_torch.learners.ccnn import CCNN
 

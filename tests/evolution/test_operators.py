@@ -11,11 +11,12 @@ from hypothesis import given, settings, strategies as st
 from torch import Tensor
 
 from ccnn_torch.evolution import Genome, decode, encode
-from ccnn_torch.evolution.genome import active, select
-from ccnn_torch.evolution.operators import (
+from ccnn_torch.evolution.genome import (
+    active,
     crossover,
     flip_connections,
     nonuniform_mutation,
+    select,
     swap_genes,
     tournament,
     weakest_draw,

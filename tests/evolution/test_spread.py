@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from ccnn_torch.evolution import MaskedNetwork
+from ccnn_torch.evolution.masked_network import readout_spread, spread_variance
 from ccnn_torch.evolution.network import average, hidden_signal
-from ccnn_torch.evolution.spread import readout_spread, spread_variance
 
 
 def _networks(

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, linearise, network_of, residual
-from ccnn_torch.evolution.refinement import refine
-from ccnn_torch.evolution.refinement_state import Refined
+from ccnn_torch.evolution.refinement import Refined, refine
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves, wave_signal
 from ccnn_torch.learners import TrainingData, structure

@@ -166,13 +166,13 @@ def test_bad_input_is_one_sentence() -> None:
         socket_problem(arm, joints, placement[:5], points)
     with pytest.raises(InputError, match="points must be one place"):
         socket_problem(arm, joints, placement, points[:, :2])
-    with pytest.raises(InputError, match="placement 2 has no row that counts"):
+    with pytest.raises(InputError, match="placement 2: needs at least 1 row that count, got 0"):
         socket_problem(arm, joints, placement, points, weights=(placement < 2).to(torch.float64))
     with pytest.raises(InputError, match="cannot determine"):
         socket_problem(arm, joints[:6], placement[:6], points[:6])
     with pytest.raises(InputError, match="noise: 0 is no standard deviation"):
         socket_problem(arm, joints, placement, points, 0.0)
-    with pytest.raises(InputError, match="at least 4 distances"):
+    with pytest.raises(InputError, match="anchor 0: needs at least 4 rows that count, got 3"):
         distance_problem(arm, joints[:3], placement[:3], points[:3, 0])
     with pytest.raises(InputError, match="at least 4 rows"):
         plane_problem(arm, joints[:3], placement[:3])

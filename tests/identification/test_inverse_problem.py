@@ -11,7 +11,7 @@ from mechanisms.five_bar import FiveBar as ClosureAlone
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import ParameterChoice, inverse_problem, solve_lm
-from ccnn_torch.identification.problems.linear import SparseResidual, row_jacobian
+from ccnn_torch.identification.problems.problem import SparseResidual, row_jacobian
 from ccnn_torch.mechanisms import load_mechanism
 
 

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Problem
-from ccnn_torch.identification.solvers.objective import FORBIDDEN, Objective
+from ccnn_torch.identification.solvers.hga import FORBIDDEN, Objective
 from ccnn_torch.identification.solvers.registry import SOLVERS, get_solver
 
 SHORT = {"generations": 40}

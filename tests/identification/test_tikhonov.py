@@ -9,7 +9,7 @@ from linkages import NOISE, measured
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import ParameterChoice, inverse_problem, l_curve, solve_lm, solve_tikhonov
-from ccnn_torch.identification.problems.linear import WeightedRows
+from ccnn_torch.identification.problems.problem import WeightedRows
 from ccnn_torch.mechanisms import load_mechanism
 
 

@@ -9,8 +9,7 @@ import torch
 import ccnn_torch
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.identify import Identification
-from ccnn_torch.identification.job import IDENTIFY
+from ccnn_torch.identification.identify import IDENTIFY, Identification
 from ccnn_torch.mechanisms import Framed, load_mechanism
 from ccnn_torch.records import write_table
 
@@ -109,7 +108,7 @@ def test_a_search_that_did_not_converge_identifies_nothing(tmp_path: Path, capsy
 
 
 def test_some_machines_that_did_not_converge_are_named_first() -> None:
-    from ccnn_torch.identification.page.tables import identified_verdict
+    from ccnn_torch.identification.page import identified_verdict
 
     found = ccnn_torch.identify(mechanism="five_bar", simulate={"machines": 4, "noise": 1e-6}, save_report=False)
     results = found.results

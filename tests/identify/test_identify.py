@@ -12,8 +12,8 @@ from scipy.optimize import approx_fprime, least_squares
 import ccnn_torch
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.identify import Identification
-from ccnn_torch.identification.measured.kinematics import make_kinematics
-from ccnn_torch.identification.page.tables import identified_tables
+from ccnn_torch.identification.measured import make_kinematics
+from ccnn_torch.identification.page import identified_tables
 from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
 from ccnn_torch.records import write_table
 from ccnn_torch.simulation.places import Places, PointsView

@@ -8,8 +8,7 @@ from mechanisms.catalogue import make
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
-from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text, read_mechanism_file
-from ccnn_torch.mechanisms.files.write_arm import dh_text, urdf_text
+from ccnn_torch.mechanisms.mechanism_file import dh_text, mechanism_text, read_mechanism_file, urdf_text
 
 ARMS = ("ur10", "ur10_positions", "panda", "scara", "urdf")
 

@@ -24,7 +24,7 @@ from ccnn_torch.effects.found_machine import FoundMachine, machine_of_block
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
-from ccnn_torch.mechanisms.files.mechanism_file import MechanismFile, read_mechanism_file
+from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
 
 Array = NDArray[Any]
 

@@ -6,7 +6,7 @@ from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import SerialArm
-from ccnn_torch.mechanisms.files.write_arm import dh_text, mjcf_text, urdf_text
+from ccnn_torch.mechanisms.mechanism_file import dh_text, mjcf_text, urdf_text
 
 
 def print_robot(model: LoadedModel | IdentifiedGeometry) -> dict[str, str]:

@@ -24,7 +24,7 @@ from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames
-from ccnn_torch.mechanisms.files.write_arm import write_machine
+from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
 

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
+from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.parameters import ParameterChoice, Selection, select_parameters
 from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations
-from ccnn_torch.identification.problems.rows import check_finite
+from ccnn_torch.identification.problems.whitened import check_finite
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
@@ -69,11 +70,9 @@ def socket_problem(
             parameters.
     """
     machine = _machine(mechanism, joints, weights, choice, start, noise)
-    group, labels = _groups(placement, joints, "placement")
+    group, parts = machine.groups(placement, "placement", 1)
     if points.shape != (len(joints), 3):
         raise InputError(f"points must be one place on the plate for each of {len(joints)} rows, got {points.shape}")
-    used = (machine.weights > 0).any(0)
-    there = _seen(mechanism, joints, machine.start)
     distinct = torch.unique(points, dim=0)
     extent = float(torch.cdist(distinct, distinct).max())
     unknown, turned, turns = [], torch.zeros_like(points), torch.zeros(len(joints), 9, dtype=torch.float64)
@@ -85,16 +84,12 @@ def socket_problem(
         sd = plate_tolerance / extent
         unknown.append(_Unknown("plate_scale", "1", 1.0, sd, sd))
     columns = torch.zeros(len(joints), 6, dtype=torch.int64)
-    for g, label in enumerate(labels):
-        mine = (group == g) & used
-        if not bool(mine.any()):
-            raise InputError(f"placement {label} has no row that counts; leave its rows out of the records")
-        rotation, place, axes = _plate_start(points[mine], there[mine])
+    for g, (label, mine) in enumerate(parts):
+        rotation, place, axes = _plate_start(points[mine], machine.there[mine])
         turned[group == g] = points[group == g] @ rotation.mT
         turns[group == g, : 3 * len(axes)] = axes.flatten()
         first = len(unknown)
-        names = zip("xyz", place.tolist(), strict=True)
-        unknown += [_Unknown(f"plate{label}_{axis}", "m", value, _PLACE) for axis, value in names]
+        unknown += _place(f"plate{label}", place)
         unknown += [_Unknown(f"plate{label}_turn{i + 1}", "rad", 0.0, _TURN) for i in range(len(axes))]
         # A turn that does not exist reads any column, since its axis is 0.
         columns[group == g] = torch.tensor([min(first + i, len(unknown) - 1) for i in range(6)])
@@ -133,19 +128,14 @@ def distance_problem(
         InputError: as `socket_problem`, or fewer than four rows of an anchor.
     """
     machine = _machine(mechanism, joints, weights, choice, start, noise)
-    group, labels = _groups(anchor, joints, "anchor")
-    used = (machine.weights > 0).any(0)
-    there = _seen(mechanism, joints, machine.start)
+    group, parts = machine.groups(anchor, "anchor", 4)
     unknown: list[_Unknown] = []
-    for g, label in enumerate(labels):
-        mine = (group == g) & used
-        if int(mine.sum()) < 4:
-            raise InputError(f"anchor {label}: its place needs at least 4 distances, got {int(mine.sum())}")
-        p, d = there[mine], distance[mine]
+    for label, mine in parts:
+        p, d = machine.there[mine], distance[mine]
         # |p|² - d² = 2 p·a - |a|² is linear in a and |a|².
         left = torch.cat([2 * p, -torch.ones_like(p[:, :1])], dim=-1)
         place = torch.linalg.lstsq(left, (p.square().sum(-1) - d.square())[:, None], driver="gelsd").solution[:3, 0]
-        unknown += [_Unknown(f"anchor{label}_{a}", "m", v, _PLACE) for a, v in zip("xyz", place.tolist(), strict=True)]
+        unknown += _place(f"anchor{label}", place)
 
     def gap(full: Tensor, others: Tensor, q: Tensor, d: Tensor, where: Tensor) -> Tensor:
         away = tool_points(mechanism, q, full) - _take(others, where)
@@ -182,17 +172,12 @@ def plane_problem(
         InputError: as `socket_problem`, or fewer than four rows of a plane.
     """
     machine = _machine(mechanism, joints, weights, choice, start, noise)
-    group, labels = _groups(plane, joints, "plane")
-    used = (machine.weights > 0).any(0)
-    there = _seen(mechanism, joints, machine.start)
+    group, parts = machine.groups(plane, "plane", 4)
     reading = torch.zeros(len(joints), dtype=torch.float64) if reading is None else reading
     unknown: list[_Unknown] = []
     normals = torch.zeros(len(joints), 9, dtype=torch.float64)
-    for g, label in enumerate(labels):
-        mine = (group == g) & used
-        if int(mine.sum()) < 4:
-            raise InputError(f"plane {label}: a plane needs at least 4 rows, got {int(mine.sum())}")
-        p, r = there[mine], reading[mine]
+    for g, (label, mine) in enumerate(parts):
+        p, r = machine.there[mine], reading[mine]
         frame = torch.linalg.svd(p - p.mean(0), full_matrices=True)[2].flip(0)
         height = p @ frame[0]
         if float(((height - height.mean()) * (r - r.mean())).sum()) < 0:
@@ -244,14 +229,36 @@ class _Unknown:
     prior_sd: float = torch.inf
 
 
+def _place(name: str, start: Tensor) -> list[_Unknown]:
+    """An unknown point, `3` [m]."""
+    return [_Unknown(f"{name}_{axis}", "m", value, _PLACE) for axis, value in zip("xyz", start.tolist(), strict=True)]
+
+
 @dataclass(frozen=True)
 class _Machine:
-    """The mechanism's side of a problem."""
+    """The mechanism's side of a problem; `there`: where the tool is at the start of the search, `s x 3` [m]."""
 
     selection: Selection
-    start: Tensor
+    there: Tensor
     weights: Tensor
     noise: float | None
+
+    def groups(self, numbers: Tensor, what: str, least: int) -> tuple[Tensor, list[tuple[str, Tensor]]]:
+        """Group number of each row, `s` int64; and of each group what it is called and which rows count, `s` bool."""
+        rows = len(self.there)
+        if numbers.shape != (rows,):
+            raise InputError(f"{what} must be one number for each of {rows} rows, got {tuple(numbers.shape)}")
+        values, group = torch.unique(numbers, return_inverse=True)
+        used = (self.weights > 0).any(0)
+        parts = [(f"{value:g}", (group == g) & used) for g, value in enumerate(values.tolist())]
+        for label, mine in parts:
+            count = int(mine.sum())
+            if count < least:
+                raise InputError(
+                    f"{what} {label}: needs at least {count_text(least, 'row')} that count, got {count}; measure it "
+                    "more often, or leave its rows out of the records"
+                )
+        return group, parts
 
     def problem(
         self, gap: Callable[..., Tensor], data: Sequence[Tensor], unknown: list[_Unknown], names: Sequence[str]
@@ -269,13 +276,11 @@ class _Machine:
 
         machines = len(self.weights)
         others = torch.tensor([[u.start, u.scale, u.prior_sd] for u in unknown], dtype=torch.float64).mT
-        parameters = (*selection.parameters, *(Parameter(u.name, u.unit, u.start) for u in unknown))
-        prior_sd = torch.cat([selection.prior_sd, others[2]])
         problem = Problem(
-            parameters=parameters,
+            parameters=(*selection.parameters, *(Parameter(u.name, u.unit, u.start) for u in unknown)),
             start=torch.cat([selection.start[0], others[0]]).expand(machines, -1).clone(),
             scale=torch.cat([selection.scale, others[1]]),
-            prior_sd=prior_sd,
+            prior_sd=torch.cat([selection.prior_sd, others[2]]),
             residual=residual,
             data=tuple(d.to(torch.float64).unsqueeze(0) for d in data),
             weights=self.weights,
@@ -302,23 +307,11 @@ def _machine(
         fixed = [n for n in there if n.startswith(("base_", "tool_r"))]
         choice = ParameterChoice(fixed=fixed)
     rows = torch.ones(len(joints), dtype=torch.float64) if weights is None else weights
-    return _Machine(select_parameters(mechanism.geometry, choice, begin), begin, rows.reshape(-1, len(joints)), noise)
-
-
-def _seen(mechanism: Mechanism, joints: Tensor, start: Tensor) -> Tensor:
-    """Where the machine that the search begins with has its tool, `s x 3` [m]; refuses joints that have no pose."""
-    points = tool_points(mechanism, joints, start)
+    points = tool_points(mechanism, joints, begin)
     used = torch.ones(1, len(joints), dtype=torch.bool)
     check_finite(points[None], used, joints[None], mechanism.joints, f"mechanism '{mechanism.name}'", "xyz")
-    return points
-
-
-def _groups(numbers: Tensor, joints: Tensor, what: str) -> tuple[Tensor, list[str]]:
-    """Group number of each row, `s` int64, and what each group is called."""
-    if numbers.shape != (len(joints),):
-        raise InputError(f"{what} must be one number for each of {len(joints)} rows, got {tuple(numbers.shape)}")
-    values, group = torch.unique(numbers, return_inverse=True)
-    return group, [f"{value:g}" for value in values.tolist()]
+    selection = select_parameters(mechanism.geometry, choice, begin)
+    return _Machine(selection, points, rows.reshape(-1, len(joints)), noise)
 
 
 def _take(others: Tensor, where: Tensor) -> Tensor:

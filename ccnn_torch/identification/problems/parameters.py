@@ -63,6 +63,15 @@ class Selection:
         fixed = self.fixed[0] if values.dim() == 1 else self.fixed
         return values @ self.spread + fixed
 
+    def free(self, whole: Tensor) -> Tensor:
+        """Values of the free ones, `... x k`, out of all, `... x K` [SI]."""
+        return whole[..., self.spread.argmax(-1)]
+
+    def places(self, parameters: Sequence[Parameter]) -> list[int]:
+        """Numbers of some free parameters among all free ones."""
+        names = [p.name for p in self.parameters]
+        return [names.index(p.name) for p in parameters]
+
 
 def select_parameters(
     geometry: Sequence[Parameter], choice: ParameterChoice | None = None, start: Tensor | None = None

@@ -1,18 +1,240 @@
-"""Whitened residuals: decorrelated and of unit variance."""
+"""Measured rows in one shape, and their residuals: decorrelated, of unit variance, and quickly differentiated."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import Parameter
+from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.parameters import Selection
-from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations
-from ccnn_torch.identification.problems.rows import MeasuredRows, inverse_root
-from ccnn_torch.identification.problems.sparse import WhitenedResidual, dependence
+from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations, row_jacobian
+from ccnn_torch.mechanisms import Mechanism
+
+
+@dataclass(frozen=True)
+class MeasuredRows:
+    """joints `r x s x n`, pose `r x s x p` (r = 1 where the machines share them), weights `r x s`; `r` machines."""
+
+    joints: Tensor
+    pose: Tensor
+    weights: Tensor
+    machines: int
+
+
+def gather_rows(
+    mechanism: Mechanism, joints: Tensor, pose: Tensor, weights: Tensor | None, start: Tensor | None
+) -> MeasuredRows:
+    """Check the shapes and count the machines.
+
+    Args:
+        joints: `s x n` or `r x s x n` [SI].
+        pose: `s x p` or `r x s x p` [SI].
+        weights: `s` or `r x s` [1]; all 1 when None.
+        start: `K` or `r x K` [SI], or None.
+    """
+    for what, table, coordinates in (("joints", joints, mechanism.joints), ("pose", pose, mechanism.pose)):
+        if table.dim() not in (2, 3) or table.shape[-1] != len(coordinates):
+            raise InputError(
+                f"{what} have the shape {tuple(table.shape)}; mechanism '{mechanism.name}' needs a column for each of "
+                f"{', '.join(c.name for c in coordinates)}"
+            )
+    q, x = (t.detach().to(torch.float64).reshape(-1, *t.shape[-2:]) for t in (joints, pose))
+    w = (
+        torch.ones(1, q.shape[1], dtype=torch.float64, device=q.device)
+        if weights is None
+        else weights.reshape(-1, weights.shape[-1])
+    )
+    counts = {len(q), len(x), len(w), 1 if start is None or start.dim() == 1 else len(start)}
+    rows = {q.shape[1], x.shape[1], w.shape[1]}
+    if len(counts | {1}) > 2 or len(rows) > 1:
+        raise InputError(
+            f"joints {tuple(q.shape)}, pose {tuple(x.shape)} and weights {tuple(w.shape)} (machines, rows, …) do not "
+            "fit together; give the same number of rows, and of machines or one for all"
+        )
+    if not bool((w >= 0).all()):
+        raise InputError("weights must be 0 or positive; a row with weight 0 is left out")
+    machines = max(counts)
+    empty = torch.nonzero(~(w > 0).any(-1))
+    if len(empty):
+        raise InputError(f"machine {int(empty[0]) + 1} of {machines}: no row has a weight above 0; keep some rows")
+    for table, coordinates in ((q, mechanism.joints), (x, mechanism.pose)):
+        wrong = torch.nonzero(~torch.isfinite(table) & (w > 0)[..., None])
+        if len(wrong):
+            raise InputError(
+                f"row {int(wrong[0, 1]) + 1}: {coordinates[int(wrong[0, 2])].name} is not a finite number; "
+                "measure it again or leave the row out"
+            )
+    return MeasuredRows(q, x, w.to(torch.float64).expand(machines, -1), machines)
+
+
+def covariance(
+    noise: float | Sequence[float] | Tensor | None, coordinates: Sequence[Coordinate], what: str
+) -> Tensor | None:
+    """Covariance of a row's noise, `… x d x d`.
+
+    Args:
+        noise: standard deviation, one for all or one for each coordinate [SI], or a covariance, `… x d x d`.
+    """
+    if noise is None:
+        return None
+    sd = torch.as_tensor(noise, dtype=torch.float64)
+    d = len(coordinates)
+    if sd.dim() >= 2 and sd.shape[-2:] == (d, d):
+        return sd
+    if sd.dim() > 1 or (sd.dim() == 1 and len(sd) != d) or not bool((sd >= 0).all() & torch.isfinite(sd).all()):
+        raise InputError(
+            f"{what}: give one standard deviation, or one for each of {', '.join(c.name for c in coordinates)} [SI], "
+            f"none negative; got {sd.tolist()}"
+        )
+    return torch.diag(sd.expand(d) ** 2)
+
+
+def inverse_root(matrix: Tensor, used: Tensor) -> Tensor:
+    """L⁻¹ of covariances L Lᵀ, `r x s x d x d`; the identity in rows that are not `used` (`r x s`, bool)."""
+    d = matrix.shape[-1]
+    unit = torch.eye(d, dtype=matrix.dtype, device=matrix.device)
+    factor, info = torch.linalg.cholesky_ex(torch.where(used[..., None, None], matrix, unit))
+    # Roundoff can leave the factor of a singular matrix a tiny pivot in place of none.
+    pivot = factor.diagonal(dim1=-2, dim2=-1)
+    spoilt = (info > 0) | (pivot <= 1e-9 * matrix.diagonal(dim1=-2, dim2=-1).abs().sqrt()).any(-1) & used
+    if bool(spoilt.any()):
+        row = int(torch.nonzero(spoilt)[0, -1]) + 1
+        raise InputError(
+            f"row {row}: the noise given leaves a direction of the residual without any; give joint_noise too, or a "
+            "pose_noise above 0 for every coordinate"
+        )
+    root: Tensor = torch.linalg.solve_triangular(factor, unit.expand_as(factor), upper=False)
+    return root
+
+
+def check_finite(
+    residual: Tensor,
+    used: Tensor,
+    given: Tensor,
+    coordinates: Sequence[Coordinate],
+    mechanism: str,
+    channels: Sequence[str],
+) -> None:
+    """Name the first row, and its channel, whose residual `r x s x c` is not finite although it is used (`r x s`).
+
+    Args:
+        given: what the kinematics were solved for, `r x s x …`, with its coordinates.
+        channels: names of the `c` columns.
+    """
+    lost = torch.nonzero(~torch.isfinite(residual) & used[..., None])
+    if not len(lost):
+        return
+    machine, row, channel = (int(i) for i in lost[0])
+    many = len(torch.unique(lost[:, 1]))
+    values = given[machine if len(given) > 1 else 0, row].tolist()
+    where = ", ".join(f"{c.name} = {v:.6g} {c.unit}" for c, v in zip(coordinates, values, strict=True))
+    place = f"row {row + 1}" + (f" of machine {machine + 1}" if len(given) > 1 else "")
+    raise InputError(
+        f"{place}: {mechanism} with its starting geometry is out of reach at {where}: {channels[channel]} has no "
+        f"solution ({many} {'row' if many == 1 else 'rows'} so in all); check units, frame and starting values, or "
+        "leave the row out"
+    )
+
+
+# Structure is read at points this many plausible errors off, so that what is zero by chance at a nominal zero shows.
+_PROBES, _AWAY = 4, 0.1
+
+
+def dependence(
+    gap: Callable[..., Tensor], start: Tensor, scale: Tensor, data: tuple[Tensor, ...], used: Tensor, entries: int
+) -> Tensor:
+    """Which entries of a row depend on which parameters, in the rows of one machine: `c x k`, bool.
+
+    Args:
+        gap: `(values, *data)` -> `… x c`.
+        start, scale: `k` [SI].
+        data: `s x …` each.
+        used: `s`, bool: rows that count.
+        entries: `c`.
+    """
+    generator = torch.Generator().manual_seed(0)
+    draw = torch.randn(_PROBES, 1, len(start), generator=generator, dtype=torch.float64).to(start.device)
+    points = (start + _AWAY * scale * draw).expand(_PROBES, len(used), -1)
+    slope = row_jacobian(gap, points, tuple(d.expand(_PROBES, *d.shape) for d in data), entries)[1]
+    known = used[:, None, None] & torch.isfinite(slope)
+    size = (torch.where(known, slope, 0.0).abs() * scale).flatten(0, 1).amax(0)
+    # Rounding in an iterative solution is no dependence.
+    return size > 1e-9 * size.max()
+
+
+def entries_together(moved: Tensor) -> list[list[int]]:
+    """Entries in groups that share no parameter, greedily; moved: `c x k`, bool."""
+    groups: list[list[int]] = []
+    for i in range(len(moved)):
+        fits = (g for g in groups if not bool((moved[g].any(0) & moved[i]).any()))
+        group = next(fits, None)
+        if group is None:
+            groups.append([i])
+        else:
+            group.append(i)
+    return groups
+
+
+class WhitenedResidual:
+    """The residual L⁻¹ gap of a row, or its entries over their standard deviations; the factor is the last of the data.
+
+    `jacobian` gives what differentiating the residual would, with a backward pass for each group of entries that share
+    no parameter in place of one for each entry.
+    """
+
+    def __init__(self, gap: Callable[..., Tensor], entries: int, kept: list[int], factor: str, moved: Tensor) -> None:
+        """factor: `full` (`c x c`, flat), `diagonal` (one for each kept entry) or `none`; moved: `c x k`, bool."""
+        self.gap = gap
+        self.entries = entries
+        self.kept = kept
+        self.factor = factor
+        self.groups = [g for g in ([i for i in g if i in kept] for g in entries_together(moved)) if g]
+        # In a group, the entry that a parameter moves (any, where it moves none: its derivative is zero).
+        self.owner = [torch.tensor(g, device=moved.device)[moved[g].to(torch.int8).argmax(0)] for g in self.groups]
+        self.sparse = len(self.groups) < len(kept)
+        self.whole = self.groups == [list(range(entries))]
+
+    def __call__(self, values: Tensor, *data: Tensor) -> Tensor:
+        difference = self.gap(values, *(data if self.factor == "none" else data[:-1]))
+        return self._weighted(difference, data)
+
+    def _weighted(self, difference: Tensor, data: tuple[Tensor, ...]) -> Tensor:
+        if self.factor == "full":
+            root = data[-1].reshape(*data[-1].shape[:-1], self.entries, self.entries)
+            return (root * difference[..., None, :]).sum(-1)
+        if len(self.kept) < self.entries:
+            difference = difference[..., self.kept]
+        return difference if self.factor == "none" else difference * data[-1]
+
+    def jacobian(self, values: Tensor, data: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """Residual `… x c` and Jacobian `… x c x k` of every row; values `… x k`."""
+        if not self.sparse:
+            return row_jacobian(self, values, data, len(self.kept))
+        point = values.detach().clone().requires_grad_()
+        with torch.enable_grad():
+            difference = self.gap(point, *(data if self.factor == "none" else data[:-1]))
+            sums = [difference.sum()] if self.whole else [difference[..., g].sum() for g in self.groups]
+        slope: Tensor | None = None
+        for i, owner in enumerate(self.owner):
+            more = i + 1 < len(sums)
+            part = torch.autograd.grad(sums[i], point, retain_graph=more, materialize_grads=True)[0][..., None, :]
+            part = part * self._share(owner, data)
+            slope = part if slope is None else slope + part
+        difference = difference.detach()
+        value = self._weighted(difference, data)
+        return value, value.new_zeros(*value.shape, values.shape[-1]) if slope is None else slope
+
+    def _share(self, owner: Tensor, data: tuple[Tensor, ...]) -> Tensor:
+        """How far the entry that a parameter moves goes into each channel, `… x c x k`."""
+        if self.factor == "full":
+            root = data[-1].reshape(*data[-1].shape[:-1], self.entries, self.entries)
+            return root.index_select(-1, owner)
+        own = owner == torch.tensor(self.kept, device=owner.device)[:, None]
+        return own if self.factor == "none" else own * data[-1][..., None]
 
 
 class Geometry:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ccnn_torch.identification.problems.linear import WeightedRows
-from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
+from ccnn_torch.identification.problems.problem import Fit, Problem, Progress, WeightedRows
 
 # Weights tried, from the largest singular value down to this share of it.
 _TRIED, _LEAST = 200, 1e-10

@@ -12,7 +12,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.fit import best_closed_form, rigid_body_frame
-from ccnn_torch.mechanisms.machines.serial import compose
+from ccnn_torch.mechanisms.machines.serial import FRAME, compose
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative
 from ccnn_torch.mechanisms.pose import Frame, frame_gap
@@ -20,8 +20,6 @@ from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix, skew
-
-_FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
 
 class Framed(Mechanism):
@@ -60,15 +58,15 @@ class Framed(Mechanism):
             raise InputError(
                 f"mechanism '{inner.name}' has no orientation: a tool frame would only shift the base; use tool=False"
             )
-        taken = {f"{place}_{c}" for place in ("base", "tool") for c, _ in _FRAME} & {g.name for g in inner.geometry}
+        taken = {f"{place}_{c}" for place in ("base", "tool") for c, _ in FRAME} & {g.name for g in inner.geometry}
         if taken:
             raise InputError(f"mechanism '{inner.name}' has frames of its own: {', '.join(sorted(taken))}")
-        frames = {place: [Parameter(f"{place}_{c}", u, 0.0) for c, u in _FRAME] for place in ("base", "tool")}
+        frames = {place: [Parameter(f"{place}_{c}", u, 0.0) for c, u in FRAME] for place in ("base", "tool")}
         start = inner.frame(inner.home_pose)
         super().__init__(
             name=f"framed_{inner.name}",
             joints=inner.joints,
-            pose=[Coordinate(c, u) for c, u in (_FRAME if turns else _FRAME[:3])],
+            pose=[Coordinate(c, u) for c, u in (FRAME if turns else FRAME[:3])],
             geometry=[*(frames["base"] if base else []), *inner.geometry, *(frames["tool"] if tool else [])],
             low=(0.0,) * (6 if turns else 3),
             high=(0.0,) * (6 if turns else 3),

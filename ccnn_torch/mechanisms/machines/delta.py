@@ -116,8 +116,6 @@ class Delta(_Parallelograms):
             high=(0.15, 0.15, -0.4),
             drives=_crank_ends,
         )
-        if type(self) is Delta:
-            self.recipe = {"spec": "delta", "keys": {}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Closed form, cranks outward; NaN out of reach of a leg."""
@@ -161,8 +159,6 @@ class DeltaLinear(_Parallelograms):
             high=(0.15, 0.15, 0.3),
             drives=_carriages,
         )
-        if type(self) is DeltaLinear:
-            self.recipe = {"spec": "delta_linear", "keys": {}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Closed form, carriages above the platform; NaN out of reach of a leg."""

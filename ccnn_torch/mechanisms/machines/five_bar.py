@@ -154,8 +154,6 @@ class FiveBar(Mechanism):
             low=(centre - radius).tolist(),
             high=(centre + radius).tolist(),
         )
-        if type(self) is FiveBar:
-            self.recipe = {"spec": "five_bar", "keys": {}}
 
     def _follow_nominal(self) -> None:
         centre, radius = inscribed_circle(*_geometry(self.nominal)[:3])

@@ -68,9 +68,8 @@ class Overconstrained2Dof(Mechanism):
             geometry=geometry,
             low=(0.0, 0.05),
             high=(2 * math.pi, 1.0),
+            keys={"origin": origin},
         )
-        if type(self) is Overconstrained2Dof:
-            self.recipe = {"spec": "overconstrained_2dof", "keys": {"origin": origin}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Eq. 13 at the frame of eqs. 4 and 7, links outward; NaN where a limb does not reach."""

@@ -122,7 +122,7 @@ def compose(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tupl
 MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
 
-_FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
+FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
 
 class SerialArm(Mechanism):
@@ -197,11 +197,11 @@ class SerialArm(Mechanism):
         n = len(links)
         types = tuple(joint_types or ["revolute"] * n)
         self._transform, names, units, self._axis_before = LINKS[convention]
-        geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(_FRAME, base, strict=True)]
+        geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(FRAME, base, strict=True)]
         for i, row in enumerate(links):
             geometry += [Parameter(f"{p}{i + 1}", u, v) for p, u, v in zip(names, units, row, strict=True)]
-        geometry += [Parameter(f"tool_{c}", u, v) for (c, u), v in zip(_FRAME, tool, strict=True)]
-        pose = _FRAME if orientation == "rotation_vector" else _FRAME[:3]
+        geometry += [Parameter(f"tool_{c}", u, v) for (c, u), v in zip(FRAME, tool, strict=True)]
+        pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
         super().__init__(
             name=name,
             joints=[Coordinate(f"q{i + 1}", "rad" if t == "revolute" else "m") for i, t in enumerate(types)],

@@ -42,9 +42,8 @@ class Tripod(Mechanism):
             low=(-0.2, 0.4, -0.3),
             high=(0.2, 0.7, 0.3),
             home_pose=(0.0, 0.55, 0.0),
+            keys={"per_leg": True} if per_leg else {},
         )
-        if type(self) is Tripod:
-            self.recipe = {"spec": "tripod", "keys": {"per_leg": True} if per_leg else {}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Eq. 15, closed form; NaN where a root is not real."""
@@ -140,9 +139,8 @@ class MachineTool(Mechanism):
             geometry=geometry,
             low=(-tilt, -tilt, 0.5),
             high=(tilt, tilt, 0.7),
+            keys={"per_leg": True} if per_leg else {},
         )
-        if type(self) is MachineTool:
-            self.recipe = {"spec": "machine_tool", "keys": {"per_leg": True} if per_leg else {}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Eq. 18: |c_i - u_i d_i| = l with d_i the guideway's direction; the smaller root, NaN where it is not real."""

@@ -53,9 +53,8 @@ class Stewart(Mechanism):
             geometry=geometry,
             low=(-0.1, -0.1, height - 0.1, -tilt, -tilt, -tilt),
             high=(0.1, 0.1, height + 0.1, tilt, tilt, tilt),
+            keys={"height": height},
         )
-        if type(self) is Stewart:
-            self.recipe = {"spec": "stewart", "keys": {"height": height}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Distances between the joints of each leg, less the offset, by the gain; closed form, for every pose."""

@@ -166,6 +166,7 @@ class IdentifiedResults(Result):
     """sentences that say what speaks against the figures: a noise that does not fit, an error that stays"""
     counts: list[Count]
     paper: Literal["001", "004"] | None
+    """null since the papers' tables are those of `python -m benchmarks.papers`"""
     data_sha256: str | None
     notes: list[str]
     versions: dict[str, str]

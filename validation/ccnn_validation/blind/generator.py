@@ -17,8 +17,7 @@ import torch
 from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.files.write import make_folder, write_whole
 from ccnn_torch.mechanisms import SerialArm
-from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text
-from ccnn_torch.mechanisms.files.write_arm import dh_text
+from ccnn_torch.mechanisms.mechanism_file import dh_text, mechanism_text
 from ccnn_torch.records import write_table
 from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_validation.blind.case import BlindCase

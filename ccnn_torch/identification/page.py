@@ -1,4 +1,4 @@
-"""The tables of an identification, from `identified.json` alone: for the screen, Markdown and the HTML report."""
+"""The page of an identification, from `identified.json` alone: for the screen, Markdown and the HTML report."""
 
 from __future__ import annotations
 
@@ -8,12 +8,48 @@ from statistics import median
 from typing import Any
 
 from ccnn_torch.display import count_text, display_unit, number_text
-from ccnn_torch.identification.page.constraint import BEFORE_SAYS, constraint_table, holder
-from ccnn_torch.identification.page.paper import paper_tables
-from ccnn_torch.identification.pose_errors import figure_text
+from ccnn_torch.identification.judge import figure_text
+from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
 from ccnn_torch.report.csv_file import write_rows
+from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.page import InlineFigure, Page, sections_of
 from ccnn_torch.report.table import Table, table_of
+
+BEFORE_SAYS = "Before: links nominal, the tool's offset fitted."
+_HOLDERS = {
+    "sockets": "the other rows of its socket put",
+    "distances": "the measured distance puts",
+    "plane": "the plane puts",
+}
+
+
+def holder(results: Mapping[str, Any]) -> str:
+    """Subject and verb that say what places the tool: `the plane puts` (the tool)."""
+    return _HOLDERS[results["constraint"]["kind"]]
+
+
+def constraint_table(results: Mapping[str, Any]) -> Table | None:
+    """Positions of plates, anchors or planes, with standard deviations."""
+    about = results.get("constraint")
+    if about is None:
+        return None
+    rows = []
+    for name, block in about["unknowns"].items():
+        scale, unit = display_unit(block["unit"], block["sd"] or 1.0)
+        sd = "not identifiable" if block["sd"] is None else f"{number_text(block['sd'] / scale, 3)} {unit}"
+        rows.append(
+            (name, f"{number_text(block['value'], 6)} {block['unit']}".removesuffix(" 1"), sd.removesuffix(" 1"))
+        )
+    count = sum(place["rows"] for place in about["placements"])
+    scale, unit = display_unit("m", about["noise"])
+    source = "as given" if about["noise_known"] else "from the residuals"
+    note = (
+        f"{count} rows in {len(about['placements'])} groups; standard deviation of one equation "
+        f"{number_text(about['noise'] / scale, 3)} {unit}, {source}. "
+        "Turns count from where the nominal machine sees them."
+    )
+    return Table(f"What held the tool ({about['kind']})", ("unknown", "value", "standard deviation"), tuple(rows), note)
+
 
 Block = Mapping[str, Any]
 
@@ -67,7 +103,6 @@ def identified_tables(results: Block) -> list[Table]:
         constraint_table(results),
         _compensation_table(results),
         _count_table(results),
-        *paper_tables(results),
     ]
     return [table for table in tables if table is not None]
 
@@ -304,3 +339,31 @@ def _rows(results: Block) -> Iterator[Row]:
 def write_identified_csv(path: str | Path, results: Block) -> None:
     """Write `identified.csv`: every figure as one tidy row, in SI, 17 significant digits; an unknown one is empty."""
     write_rows(path, _HEADER, _rows(results))
+
+
+_LINKED = (
+    "identified.json",
+    "identified.csv",
+    "identified.md",
+    "identified.yaml",
+    "identified_dh.yaml",
+    "identified.urdf",
+    "config.yaml",
+)
+
+
+def write_identified_report(folder: str | Path, results: Mapping[str, Any] | None = None) -> Path:
+    """Write `plots/` and `report.html`; the same files give the same report, so it can be written again at any time.
+
+    Args:
+        folder: with arrays, and `identified.json`, which is read when `results` is None.
+    """
+    # Loads matplotlib, which only a report waits for.
+    from ccnn_torch.identification.figures import identified_plots
+    from ccnn_torch.report.figures.style import inline_figures
+
+    folder = Path(folder)
+    results = read_json(folder / "identified.json") if results is None else results
+    arrays = load_tensors(folder / ARRAYS_FILE)[0]
+    figures = inline_figures(identified_plots(results, arrays), folder / "plots")
+    return identified_page(results, figures).write_html(folder / "report.html", _LINKED)

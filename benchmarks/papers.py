@@ -1,13 +1,26 @@
-"""Printed figures of the two identification papers, for comparison."""
+"""`ccnn identify` with the printed figures of two papers beside its own: Sun et al. (2018), and divide and conquer.
+
+    python -m benchmarks.papers experiments/overconstrained_2dof.yaml
+    python -m benchmarks.papers experiments/five_bar.yaml
+
+Arguments are a config and overrides, as of `ccnn identify`; the paper is that of the mechanism.
+`python -m benchmarks.global_searches` does the same with three more methods.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from ccnn_torch.display import number_text
-from ccnn_torch.identification.pose_errors import figure_text
-from ccnn_torch.report.table import Table
+from ccnn_torch.identification.config import IdentifyConfig
+from ccnn_torch.identification.identify import IDENTIFY, RESULTS
+from ccnn_torch.identification.judge import figure_text
+from ccnn_torch.report.json_files import read_json
+from ccnn_torch.report.screen import stdout
+from ccnn_torch.report.table import Table, print_table
 
 MM, DEG = 1e-3, 0.017453292519943295
 
@@ -49,12 +62,10 @@ _LM_NOTE = "of lm the paper prints one position only (-0.102 for -1.5 mm, off by
 
 
 def paper_tables(results: Mapping[str, Any]) -> list[Table]:
-    """The tables that put a paper's printed figures beside ours; none where the run is no paper's experiment."""
-    if results["paper"] == "001":
+    """The tables that put a paper's printed figures beside ours; none where its mechanism is in neither."""
+    if results["mechanism"] == "overconstrained_2dof":
         return [_table_two(results), _figures_seven_eight(results)]
-    if results["paper"] == "004":
-        return [_table_three(results)]
-    return []
+    return [_table_three(results)] if results["mechanism"] == "five_bar" else []
 
 
 def _table_two(results: Mapping[str, Any]) -> Table:
@@ -143,3 +154,14 @@ def _table_three(results: Mapping[str, Any]) -> Table:
     )
     columns = ("method", "poses measured", "numbers measured", "cost of the inversion")
     return Table("Table 3 of the paper beside ours", columns, tuple(rows), note)
+
+
+def main(config: Path, *overrides: str) -> None:
+    """Identify, and print the tables."""
+    folder = IDENTIFY.start(IdentifyConfig.from_file(config, overrides)).path
+    for table in paper_tables(read_json(folder / RESULTS)):
+        print_table(table, stdout)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), *sys.argv[2:])

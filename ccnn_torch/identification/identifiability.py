@@ -1,18 +1,87 @@
-"""Standard errors, correlations and the directions that the rows do not determine."""
+"""What the rows determine: standard errors, correlations, hidden directions in words, and a bootstrap over rows."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.linalg import qr
+from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtri, stdtrit
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.identifiability.combinations import TAKES_PART, combinations_in_words
-from ccnn_torch.identification.problems.linear import OPEN, WeightedRows
-from ccnn_torch.identification.problems.problem import Problem
+from ccnn_torch.identification.problems.problem import OPEN, Fit, Problem, Solver, WeightedRows
+
+# Component of a hidden direction below which a parameter does not take part. Real geometry is never exactly parallel:
+# smaller components come from the errors themselves and would tie everything to everything.
+TAKES_PART = 1e-2
+
+
+def combinations_in_words(parameters: Sequence[Parameter], hidden: Tensor, scale: Tensor) -> tuple[str, ...]:
+    """A sentence for each group of parameters that hidden directions tie together.
+
+    `A1x and l1 only as 1.00 A1x - 0.72 l1`: of errors of the two, in SI, the rows see this combination and no other.
+
+    Args:
+        hidden: directions that the rows do not see, orthonormal or zero, one a row, `… x k`, in units of `scale`.
+        scale: `k` [SI].
+    """
+    rows = hidden.detach().cpu().numpy()
+    projector = rows.T @ rows
+    part = np.diag(projector) > TAKES_PART**2
+    count, group = connected_components((np.abs(projector) > TAKES_PART) & part & part[:, None], directed=False)
+    sizes = scale.cpu().numpy()
+    sentences = []
+    for number in range(count):
+        members = np.flatnonzero((group == number) & part).tolist()
+        if len(members):
+            visible = _visible(projector[np.ix_(members, members)]) / sizes[members]
+            sentences.append(_sentence([parameters[i].name for i in members], visible))
+    return tuple(sentences)
+
+
+def _visible(projector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Combinations that the rows see, the complement of a group's hidden directions, each with a parameter of its own:
+    reduced echelon form, `visible x members`."""
+    values, vectors = np.linalg.eigh(projector)
+    basis = vectors[:, values < 0.5].T
+    if not len(basis):
+        return basis
+    own = np.sort(qr(basis, mode="economic", pivoting=True)[2][: len(basis)])
+    reduced: NDArray[np.float64] = np.linalg.solve(basis[:, own], basis)
+    return np.where(np.abs(reduced) < TAKES_PART, 0.0, reduced)
+
+
+def _sentence(names: list[str], visible: NDArray[np.float64]) -> str:
+    everyone = _listed(names)
+    if not len(visible):
+        return f"{everyone} not at all"
+    return f"{everyone} only as {_listed([_combination(names, row) for row in visible])}"
+
+
+def _combination(names: list[str], row: NDArray[np.float64]) -> str:
+    """With 1.00 before its first parameter."""
+    taking = np.flatnonzero(row)
+    row = row / row[taking[0]]
+    text = f"{_number(row[taking[0]])} {names[taking[0]]}"
+    for i in taking[1:]:
+        text += f" {'-' if row[i] < 0 else '+'} {_number(abs(row[i]))} {names[i]}"
+    return text
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if 0.1 <= value < 1000 else f"{value:.3g}"
+
+
+def _listed(texts: list[str]) -> str:
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
+
 
 # Singular values below this share of the largest are rounding.
 _RANK = 1e-9
@@ -151,3 +220,87 @@ def _tall(matrix: Tensor) -> Tensor:
     if missing <= 0:
         return matrix
     return torch.cat([matrix, matrix.new_zeros(*matrix.shape[:-2], missing, matrix.shape[-1])], dim=-2)
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """Fits to redrawn rows.
+
+    Attributes:
+        values: `count x r x k` [SI].
+        converged: `count x r`, bool.
+    """
+
+    values: Tensor
+    converged: Tensor
+
+    def sd(self) -> Tensor:
+        """Standard deviation over the draws, `r x k` [SI]."""
+        return self.values.std(0)
+
+    def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
+        """Percentiles over the draws that hold the share `level`, low and high, `r x k` each [SI]."""
+        tails = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=self.values.dtype, device=self.values.device)
+        low, high = torch.quantile(self.values, tails, dim=0)
+        return low, high
+
+
+def bootstrap(problem: Problem, fit: Fit, solver: Solver, count: int = 200, seed: int = 0) -> Bootstrap:
+    """Solve the problem again with redrawn rows, all draws as machines side by side in one call of the solver.
+
+    The residual rows that the fit leaves are drawn with replacement and put to the fitted ones (Efron 1979), raised by
+    sqrt(N / (N - k)) for the parameters fitted; it keeps the poses.
+
+    Args:
+        problem: as it was solved.
+        fit: what the solver found; searches begin there.
+        solver: the one to try.
+        count: draws.
+        seed: of the draws; the solver gets it too.
+
+    Raises:
+        InputError: fewer than two draws.
+    """
+    if count < 2:
+        raise InputError(f"a bootstrap has at least 2 draws; got {count}")
+    generator = torch.Generator().manual_seed(seed)
+    r, s = problem.weights.shape
+    device = problem.start.device
+    uniform = torch.rand(count, r, s, generator=generator, dtype=torch.float64).to(device)
+
+    def repeated(table: Tensor) -> Tensor:
+        """`count * r x …` from `r x …`; what all machines share stays one."""
+        return table if len(table) == 1 else table.repeat(count, *[1] * (table.dim() - 1))
+
+    # The prior pulls to where it pulled before.
+    start = problem.start if bool(torch.isfinite(problem.prior_sd).any()) else fit.values
+    again = dataclasses.replace(
+        problem,
+        start=start.repeat(count, 1),
+        weights=problem.weights.repeat(count, 1),
+        data=(*(repeated(d) for d in problem.data), _redrawn(problem, fit.values, uniform)),
+        residual=lambda values, *rows: problem.residual(values, *rows[:-1]) + rows[-1],
+    )
+    found = solver(again, seed)
+    return Bootstrap(found.values.reshape(count, r, -1), found.converged.reshape(count, r))
+
+
+def _redrawn(problem: Problem, values: Tensor, uniform: Tensor) -> Tensor:
+    """What to add to the residual so that at `values` it is one drawn from those left there: `count * r x s x c`."""
+    rows = WeightedRows(dataclasses.replace(problem, weights=(problem.weights > 0).to(values)))
+    everyone = torch.arange(len(values), device=values.device)
+    kept = (problem.weights > 0).any(0)
+    left = values.new_zeros(*problem.weights.shape, len(problem.channels))
+    left[:, kept] = rows.residuals(values[:, None], everyone)[:, 0]
+    root = problem.weights.sqrt()[..., None]
+    equations = (problem.weights > 0).sum(-1) * len(problem.channels)
+    raised = (equations / (equations - values.shape[-1]).clamp_min(1)).sqrt()[:, None, None]
+    pool = left * root
+    pool = (pool - pool.sum(-2, keepdim=True) / (root > 0).sum(-2, keepdim=True)) * raised
+    # The n-th used row of a machine, n drawn uniformly.
+    order = torch.argsort((problem.weights == 0).to(torch.int8), dim=-1, stable=True)
+    number = (uniform * (problem.weights > 0).sum(-1)[:, None]).long()
+    chosen = torch.take_along_dim(order.expand_as(number), number, dim=-1)
+    drawn = torch.take_along_dim(pool.expand(*number.shape, -1), chosen[..., None], dim=-2)
+    offset = torch.where(root > 0, drawn / root.clamp_min(1e-300), 0.0) - left
+    return offset.flatten(0, 1)

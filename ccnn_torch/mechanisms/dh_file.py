@@ -1,4 +1,4 @@
-"""A serial arm from a YAML file with its maker's Denavit-Hartenberg table."""
+"""A serial arm from a YAML file with its maker's Denavit-Hartenberg table, or from a URDF."""
 
 from __future__ import annotations
 

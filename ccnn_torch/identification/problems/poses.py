@@ -1,21 +1,110 @@
-"""Forward calibration: the measured pose against the one that the forward kinematics of the joints give."""
+"""Measured poses as equations: against joints (inverse calibration) or against computed poses (forward calibration).
+
+Inverse calibration: Zhuang, Yan and Masory (1998); eq. 5 of the divide-and-conquer paper. The difference is the
+pseudoerror of eq. 1 of Zhang and Gao (2012).
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.identification.problems.inverse import Noise
 from ccnn_torch.identification.problems.parameters import ParameterChoice, select_parameters
 from ccnn_torch.identification.problems.problem import Problem
-from ccnn_torch.identification.problems.rows import check_finite, covariance, gather_rows
-from ccnn_torch.identification.problems.whitened import Geometry, whitened_problem
+from ccnn_torch.identification.problems.whitened import (
+    Geometry,
+    check_finite,
+    covariance,
+    gather_rows,
+    whitened_problem,
+)
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+
+Noise = float | Sequence[float] | Tensor
+"""Standard deviation, one for all coordinates or one each [SI]; or their covariance."""
+
+
+def inverse_problem(
+    mechanism: Mechanism,
+    joints: Tensor,
+    pose: Tensor,
+    weights: Tensor | None = None,
+    choice: ParameterChoice | None = None,
+    pose_noise: Noise | None = None,
+    joint_noise: Noise | None = None,
+    start: Tensor | None = None,
+    per_leg: bool = False,
+) -> Problem:
+    """Residual g(X; theta) - q of the inverse kinematics g at the measured poses, divided by its noise.
+
+    The noise of a residual row is that of the joints and that of the pose, carried over by dg/dX at the starting
+    geometry. The rows are decorrelated by its Cholesky factor, so that least squares weighs every direction of the
+    pose as it was measured; with `per_leg` each joint is only divided by its own standard deviation, so that the legs
+    stay apart (`split_by_leg`), and joints that no free parameter moves are left out. Without any noise given, the
+    residual is in joint units and its variance is estimated from the fit.
+
+    Where the geometry found is far from the start, build the problem again with `start` there: the noise is then
+    carried over by the right geometry.
+
+    Args:
+        mechanism: any with an inverse; where that is iterative, it starts from the measured joints.
+        joints: `s x n` or `r x s x n`, as commanded or read [SI].
+        pose: `s x p` or `r x s x p`, measured [SI].
+        weights: `s` or `r x s` [1]; 0 leaves a row out; all 1 when None.
+        choice: what is free, fixed, tied, held by a prior; everything free when None.
+        pose_noise: standard deviation of each pose coordinate, one for all or `p` of them [SI], or the covariance,
+            `p x p` or `r x s x p x p`.
+        joint_noise: likewise of the joints.
+        start: the whole geometry from which the search begins, `K` or `r x K` [SI]; nominal when None.
+        per_leg: keep the channels of different legs apart.
+
+    Raises:
+        InputError: a pose out of reach (the row and the joint are named), columns or noise of another shape, a noise
+            that is singular, a prior without noise, fewer equations than parameters, or a choice that does not fit the
+            mechanism.
+    """
+    rows = gather_rows(mechanism, joints, pose, weights, start)
+    whole = (mechanism.nominal if start is None else start.detach()).reshape(-1, len(mechanism.nominal))
+    selection = select_parameters(mechanism.geometry, choice, whole)
+    names = [j.name for j in mechanism.joints]
+    turn = 2 * math.pi * torch.tensor([j.unit == "rad" for j in mechanism.joints], dtype=torch.float64)
+    turn = turn.to(rows.joints.device)
+    geometry = Geometry(selection, rows.joints.shape[1])
+
+    def gap(values: Tensor, x: Tensor, q: Tensor, *fixed: Tensor) -> Tensor:
+        difference = mechanism.solve_inverse(x, geometry(values, *fixed), q) - q
+        return difference - (difference.detach() / (2 * math.pi)).round() * turn
+
+    data = (rows.pose, rows.joints, *geometry.data)
+    used = rows.weights > 0
+    first = gap(selection.start[:, None], *data)
+    check_finite(first, used, rows.pose, mechanism.pose, mechanism.name, [f"joint {n}" for n in names])
+
+    of_pose = covariance(pose_noise, mechanism.pose, "pose_noise")
+    total = covariance(joint_noise, mechanism.joints, "joint_noise")
+    if of_pose is not None:
+        point = rows.pose.expand(len(first), -1, -1)
+        slope = jacobian_of(lambda x: mechanism.solve_inverse(x, whole[:, None], rows.joints), point)[1]
+        carried = slope @ of_pose @ slope.mT
+        total = carried if total is None else carried + total
+    return whitened_problem(
+        gap,
+        data,
+        total,
+        rows,
+        selection,
+        names,
+        f"joint of mechanism '{mechanism.name}'",
+        total is not None,
+        per_leg,
+    )
+
 
 _TURN = ("rx", "ry", "rz")
 

@@ -1,0 +1,218 @@
+"""Rows of an identification: measured records, split, or another series of the same arm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.config.sizes import sizes_of_joints, sizes_of_pose
+from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification.config import IdentifyConfig
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames, load_mechanism
+from ccnn_torch.records import Records, check_rows, load_records
+
+# Each round of `command` shrinks the remainder by about the relative size of the errors.
+_COMMAND_ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """A mechanism and whether its machines leave the nominal motion (`as_built`, `pose_near` of the mechanism)."""
+
+    mechanism: Mechanism
+    built: bool = False
+
+    def frame(self, joints: Tensor, parameters: Tensor, guess: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Platform frame: position `... x 3` [m] and rotation `... x 3 x 3` (None without orientation)."""
+        if self.built:
+            mechanism: Any = self.mechanism
+            position, rotation = mechanism.as_built(joints, parameters)
+            return position, rotation
+        return self.mechanism.frame(self.mechanism.forward_kinematics(joints, parameters, guess))
+
+    def reached(self, joints: Tensor, parameters: Tensor, guess: Tensor | None) -> Tensor:
+        """Pose, `... x p` [SI]; of a machine that leaves the nominal motion the pose nearest to its frame."""
+        if not self.built:
+            return self.mechanism.forward_kinematics(joints, parameters, guess)
+        mechanism: Any = self.mechanism
+        pose: Tensor = mechanism.pose_near(*self.frame(joints, parameters, guess))
+        return pose
+
+    def command(self, wanted: Tensor, parameters: Tensor, guess: Tensor) -> Tensor:
+        """Joints that take a machine with these parameters to a pose, `... x n` [SI].
+
+        Exact: off the nominal motion the inverse kinematics of the pose alone are a first guess, corrected by the
+        joints between the wanted pose and the one reached until nothing is left.
+        """
+        joints = self.mechanism.solve_inverse(wanted, parameters, guess)
+        if not self.built:
+            return joints
+        ideal = joints
+        for _ in range(_COMMAND_ROUNDS):
+            there = self.mechanism.solve_inverse(self.reached(joints, parameters, wanted), parameters, guess)
+            joints = joints + self.mechanism.wrap(ideal - there)
+        return joints
+
+
+def make_kinematics(mechanism: Mechanism, built: bool) -> Kinematics:
+    """Check that the mechanism knows how it is built."""
+    if built and not (hasattr(mechanism, "as_built") and hasattr(mechanism, "pose_near")):
+        raise InputError(
+            f"simulate.as_built: {mechanism.name} never leaves its nominal motion, so that there is nothing to "
+            "simulate; remove the key"
+        )
+    return Kinematics(mechanism, built)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Measured configurations of `r` machines, rows in the order measured.
+
+    Attributes:
+        joints: as recorded, `r x s x n` [SI].
+        observed: what was measured, `r x s x o` [SI]: pose coordinates of the view, or values of a constraint.
+    """
+
+    joints: Tensor
+    observed: Tensor
+
+    def of(self, machines: Tensor) -> Rows:
+        """The rows of some machines."""
+        return Rows(self.joints[machines], self.observed[machines])
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Everything that is fixed before the first solver starts.
+
+    Attributes:
+        mechanism: what is identified.
+        kinematics: how its machines move.
+        view: the mechanism as the instrument sees it; its pose coordinates are the columns of `Rows.observed`. The
+            mechanism itself, or a view with the same parameters where points on the platform are measured.
+        rows: from which all is identified.
+        test: held-out rows; their `observed` are poses of the mechanism.
+        start: where the search begins, `r x K` [SI]: nominal, or with the frames fitted.
+        leg_rows: rows for one leg alone, by leg, where each leg has poses of its own; else empty.
+        truth: the simulated machines' parameters, `r x K` [SI]; None for records.
+        wanted, wanted_joints: held-out poses that machines are sent to, `r x t x p` [SI], and joints near by,
+            `r x t x n` [SI], which select the branch; None for records.
+        reached: true poses of the held-out rows, `r x t x p` [SI]; None for records.
+        map: poses of the map, `m x p` [SI]; None where none is drawn.
+        pose_noise: standard deviation of each observed coordinate, `o` [SI]; None where it is to be estimated.
+        joint_noise: of the recorded joints, `n` [SI]; None where there is none.
+        data_hash: SHA-256 of the records; empty for simulated data.
+        notes: sentences for the person who reads the results.
+    """
+
+    mechanism: Mechanism
+    kinematics: Kinematics
+    view: Mechanism
+    rows: Rows
+    test: Rows
+    start: Tensor
+    leg_rows: dict[int, Rows] = field(default_factory=dict)
+    truth: Tensor | None = None
+    wanted: Tensor | None = None
+    wanted_joints: Tensor | None = None
+    reached: Tensor | None = None
+    map: Tensor | None = None
+    pose_noise: Tensor | None = None
+    joint_noise: Tensor | None = None
+    data_hash: str = ""
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def machines(self) -> int:
+        return len(self.start)
+
+
+def nominal_machine(config: IdentifyConfig) -> Mechanism:
+    """The mechanism that the config names, with as many parameters a link as it asks for."""
+    mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
+    if config.links == "given":
+        return mechanism
+    if not isinstance(mechanism, SerialArm):
+        raise InputError(f"links: {mechanism.name} is no serial arm; remove the key")
+    return mechanism.with_link_frames()
+
+
+def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> Measured:
+    """Load and split the records of a config, or those that Python has."""
+    assert config.records is not None
+    source = with_test_file(config.records if given is None else given, config.split)
+    records, mechanism = read_records(config, source, mechanism)
+    train, test = split_records(config, records)
+    start = _start(mechanism, train)
+    far = []
+    if isinstance(mechanism, SerialArm):
+        far = judge_frames(mechanism, train.joints[0], train.observed[0], start, where=records.path)
+    joint_noise = config.joint_noise
+    return Measured(
+        mechanism=mechanism,
+        kinematics=Kinematics(mechanism),
+        view=mechanism,
+        rows=train,
+        test=test,
+        start=start,
+        pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),
+        joint_noise=None if joint_noise is None else sizes_of_joints(joint_noise, mechanism.joints, "joint_noise"),
+        data_hash=records.data_hash,
+        notes=[*held_out_notes(config.split, test.joints.shape[1]), *_notes(records), *far],
+    )
+
+
+def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[Records, Mechanism]:
+    """Records that fit a mechanism, and the mechanism as it was measured there (with or without orientation)."""
+    records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
+    if isinstance(mechanism, SerialArm):
+        if mechanism.frame_per or mechanism.tool_per:
+            raise InputError(
+                f"{config.mechanism}: frame_per and tool_per give each group of rows a frame of its own; remove them "
+                "to identify one machine, or identify from the rows of one group"
+            )
+        if records.orientation == "none" and mechanism.orientation != "none":
+            mechanism = mechanism.with_orientation("none")
+    elif len(records.pose_coordinates) != len(mechanism.pose):
+        there = {c.name for c in records.pose_coordinates}
+        missing = [c.header for c in mechanism.pose if c.name not in there]
+        raise InputError(f"{records.path}: {mechanism.name} needs the columns {', '.join(missing)}, too")
+    if not config.frame.base and not config.frame.tool:
+        check_rows(records, mechanism)
+        _check_joints(records, mechanism)
+    return records, mechanism
+
+
+def _check_joints(records: Records, mechanism: Mechanism) -> None:
+    """Refuse rows whose joints the nominal machine cannot take: no residual is known there, and no error before."""
+    reached = mechanism.forward_kinematics(records.joints, guess=records.pose)
+    lost = torch.nonzero(~torch.isfinite(reached).all(-1)).squeeze(-1).numpy()
+    if len(lost):
+        raise InputError(
+            f"{records.path}: {mechanism.name} has no pose for the joints at {records.name_rows(lost)}; correct or "
+            f"remove {'it' if len(lost) == 1 else 'them'}, or check the units and the order of the joints"
+        )
+
+
+def split_records(config: IdentifyConfig, records: Records) -> tuple[Rows, Rows]:
+    """Rows to identify from, and rows that judge."""
+    held = rows_of_test_file(config.split, records.parts)
+    split = split_by(config.split, records.positions, records.columns, config.seed, 0.0, held)
+    train, test = (Rows(records.joints[None, i], records.pose[None, i]) for i in (split.train, split.test))
+    return train, test
+
+
+def _start(mechanism: Mechanism, rows: Rows) -> Tensor:
+    """Where the search starts, `1 x K`: frames that are unknown have to be fitted first."""
+    if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:
+        return mechanism.nominal[None].clone()
+    return fit_frames(mechanism, rows.joints[0], rows.observed[0])[None]
+
+
+def _notes(records: Records) -> list[str]:
+    """Without those of columns that are no inputs here."""
+    return [note for note in records.notes if not note.startswith(("ignored columns", "column '"))]
