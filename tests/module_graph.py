@@ -8,8 +8,8 @@ import onnx
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation.export.graph import Graph
-from ccnn_torch.compensation.export.traced import Traced, rows_apart_from
+from ccnn_torch.compensation.targets.onnx_export import Traced, rows_apart_from
+from ccnn_torch.compensation.targets.onnx_graph import Graph
 
 
 def to_onnx(module: torch.nn.Module, inputs: Mapping[str, Tensor], outputs: Sequence[str]) -> onnx.ModelProto:

@@ -10,21 +10,16 @@ if TYPE_CHECKING:
         default_limit as default_limit,
     )
     from ccnn_torch.compensation.domain import Domain as Domain
-    from ccnn_torch.compensation.effects.effects import (
+    from ccnn_torch.compensation.effects import (
         Care as Care,
         PhysicalEffects as PhysicalEffects,
         effect_deviation as effect_deviation,
         expand_effects as expand_effects,
         gains as gains,
     )
+    from ccnn_torch.compensation.expansions import expand as expand
     from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
-    from ccnn_torch.compensation.geometry.chebyshev import expand as expand
-    from ccnn_torch.compensation.machine.inverse import build_machine as build_machine
-    from ccnn_torch.compensation.machine.machine import Machine as Machine, Rule as Rule
-    from ccnn_torch.compensation.machine.parts import (
-        geometric_deviation as geometric_deviation,
-        machine_parts as machine_parts,
-    )
+    from ccnn_torch.compensation.machine import Machine as Machine, Rule as Rule, build_machine as build_machine
     from ccnn_torch.compensation.model_files.identified import (
         IdentifiedGeometry as IdentifiedGeometry,
         load_compensation as load_compensation,
@@ -42,6 +37,10 @@ if TYPE_CHECKING:
         network_from_description as network_from_description,
         register_network as register_network,
     )
+    from ccnn_torch.compensation.parts import (
+        geometric_deviation as geometric_deviation,
+        machine_parts as machine_parts,
+    )
     from ccnn_torch.compensation.targets.export import export_model as export_model
 else:
     __getattr__, __all__ = door(
@@ -49,12 +48,11 @@ else:
         {
             "compensator": "Compensator Solution default_limit",
             "domain": "Domain",
-            "effects.effects": "Care PhysicalEffects effect_deviation expand_effects gains",
+            "effects": "Care PhysicalEffects effect_deviation expand_effects gains",
             "fit": "fit_compensator",
-            "geometry.chebyshev": "expand",
-            "machine.inverse": "build_machine",
-            "machine.machine": "Machine Rule",
-            "machine.parts": "geometric_deviation machine_parts",
+            "expansions": "expand",
+            "machine": "Machine Rule build_machine",
+            "parts": "geometric_deviation machine_parts",
             "model_files.identified": "IdentifiedGeometry load_compensation sign_model",
             "model_files.load": "LoadedModel load_model",
             "model_files.save": "FORMS card_name save_model",

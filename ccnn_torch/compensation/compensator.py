@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation.contraction import TOLERANCE
 from ccnn_torch.compensation.domain import Domain
-from ccnn_torch.compensation.effects.effects import PhysicalEffects
-from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
-from ccnn_torch.compensation.machine.machine import ASTRAY, SETTLED, Machine
+from ccnn_torch.compensation.effects import PhysicalEffects
+from ccnn_torch.compensation.expansions import ChebyshevExpansion
+from ccnn_torch.compensation.machine import ASTRAY, SETTLED, Machine
 from ccnn_torch.compensation.networks import UncertainNetwork
 from ccnn_torch.compensation.secant import Step, next_correction
 from ccnn_torch.coordinates import Coordinate

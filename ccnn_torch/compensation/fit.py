@@ -18,9 +18,9 @@ from ccnn_torch.compensation.contraction import (
     steepest,
 )
 from ccnn_torch.compensation.domain import Domain
-from ccnn_torch.compensation.effects.effects import PhysicalEffects
-from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
-from ccnn_torch.compensation.machine.machine import ASTRAY, FARTHEST, Machine
+from ccnn_torch.compensation.effects import PhysicalEffects
+from ccnn_torch.compensation.expansions import ChebyshevExpansion
+from ccnn_torch.compensation.machine import ASTRAY, FARTHEST, Machine
 from ccnn_torch.compensation.secant import Step, secant_steps
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ccnn_torch.compensation.machine.machine import FARTHEST
+from ccnn_torch.compensation.machine import FARTHEST
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator, status_of
-from ccnn_torch.compensation.machine.machine import ASTRAY
+from ccnn_torch.compensation.machine import ASTRAY
 from ccnn_torch.compensation.secant import Step
 
 

@@ -15,7 +15,7 @@ from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.compensation import IdentifiedGeometry, load_compensation
-from ccnn_torch.compensation.wanted_poses import WantedPoses
+from ccnn_torch.compensation.job import WantedPoses
 from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
 from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError

@@ -32,9 +32,9 @@ from ccnn_torch.compensation import (
     load_model,
     save_model,
 )
-from ccnn_torch.compensation.agreement import probe_points
-from ccnn_torch.compensation.export.export import verify
 from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS
+from ccnn_torch.compensation.targets.golden import probe_points
+from ccnn_torch.compensation.targets.onnx_export import verify
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.mechanisms import Tripod, load_mechanism

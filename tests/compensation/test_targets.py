@@ -24,15 +24,14 @@ from torch import Tensor
 
 from ccnn_torch import export_model
 from ccnn_torch.compensation import Compensator
-from ccnn_torch.compensation.export.export import export_float32
 from ccnn_torch.compensation.model_files.identified import load_geometry
 from ccnn_torch.compensation.model_files.onnx_session import open_onnx
 from ccnn_torch.compensation.targets import from_graph
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of, traced_program
-from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
-from ccnn_torch.compensation.targets.run import run_form, run_program
+from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal, run_form, run_program
+from ccnn_torch.compensation.targets.onnx_export import export_float32
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import load_mechanism

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.guard import Promise, as_rows, kept
-from ccnn_torch.compensation.machine.alone import ROWS, all_over, machine_alone
 from ccnn_torch.compensation.model_files.card import MODEL_FORMS, card_of, read_model
 from ccnn_torch.compensation.model_files.load import LoadedModel, load_model, machine_of_model
 from ccnn_torch.compensation.model_files.metadata import description_of, from_json
 from ccnn_torch.compensation.model_files.signature import check_signature, sign_content, signature_path
+from ccnn_torch.compensation.parts import ROWS, all_over, machine_alone
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.effects.found_machine import FoundMachine, machine_of_block

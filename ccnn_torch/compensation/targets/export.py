@@ -8,7 +8,6 @@ from hashlib import sha256
 from pathlib import Path
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.export.export import export_onnx
 from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry, load_compensation
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.model_files.save import model_contents
@@ -17,14 +16,45 @@ from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of
 from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
 from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
-from ccnn_torch.compensation.targets.robot import print_robot
+from ccnn_torch.compensation.targets.onnx_export import export_onnx
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.compensation.targets.table import print_tables
-from ccnn_torch.errors import InputError, ModelFileError
+from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
+from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
+from ccnn_torch.mechanisms.files.write_arm import dh_text, mjcf_text, urdf_text
 from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
+
+
+def print_robot(model: LoadedModel | IdentifiedGeometry) -> dict[str, str]:
+    """Contents of the files by name: `robot.urdf`, `robot.xml` (MJCF), and `robot.yaml` where the arm has a DH table.
+
+    Raises:
+        MethodFailedError: the model has no identified links, or its machine is no serial arm.
+    """
+    arm = _arm(model)
+    texts = {"robot.urdf": urdf_text(arm), "robot.xml": mjcf_text(arm)}
+    return texts if arm.convention == "urdf" else texts | {"robot.yaml": dh_text(arm)}
+
+
+def _arm(model: LoadedModel | IdentifiedGeometry) -> SerialArm:
+    if isinstance(model, IdentifiedGeometry):
+        if isinstance(model.identified, SerialArm):
+            return model.identified
+        raise MethodFailedError(
+            f"a URDF is a tree, and '{model.identified.name}' is no serial arm; its parameters are in identified.yaml"
+        )
+    machine = None if model.compensator is None else model.compensator.machine
+    if machine is None or not isinstance(machine.mechanism, SerialArm):
+        raise MethodFailedError(
+            "this model has no identified links of an arm to write; train with geometry=identify, or give the "
+            "identified.yaml of ccnn identify"
+        )
+    arm = machine.real
+    assert isinstance(arm, SerialArm)
+    return arm
+
 
 DTYPES = ("float64", "float32")
 # What a controller needs: without the way back and the standard deviation a graph takes three quarters of the time.

@@ -7,6 +7,8 @@ import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +16,29 @@ from ccnn_torch.compensation.routines import Copy, Routine, Statement
 from ccnn_torch.compensation.targets.form import BOOLEAN, Array, Expression, Form, Leaf, Let, Loop, Program, leaves
 from ccnn_torch.display import plain
 from ccnn_torch.errors import MethodFailedError
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+
+def filled(template: str, **values: Any) -> str:
+    """A file's text; a name in the template that no value has is an error."""
+    return _environment().get_template(template).render(**values)
+
+
+@cache
+def _environment() -> Environment:
+    # Loaded with the package by everybody who compensates, and needed by who exports alone.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    return Environment(
+        loader=PackageLoader("ccnn_torch.compensation.targets"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+
 
 # What is used once is written where it is used, up to so many characters.
 _LONGEST = 90

@@ -1,20 +1,61 @@
-"""The compensator's routines as an ONNX graph: each function is traced once, and written as often as it is called."""
+"""The compensator as ONNX: printed node by node, and verified against the eager model when it is made.
+
+In double, ONNX Runtime has kernels for Gemm, Sigmoid, Tanh, Exp, Sin, Cos, Min, Max, Where, comparisons and arithmetic,
+and none for Tan, Asin, Acos, Atan, Softplus, Elu, Gelu and Erf: a network made of those cannot be exported.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+import math
+from collections.abc import Callable, Sequence
+from itertools import count
 from typing import Any, ClassVar
 
+import numpy as np
 import onnx
 import torch
+from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKernel
 from torch import Tensor
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator, status_of
-from ccnn_torch.compensation.export.graph import Graph, Value
-from ccnn_torch.compensation.export.traced import Traced, rows_apart_from
-from ccnn_torch.compensation.machine.machine import ASTRAY
-from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
+from ccnn_torch.compensation.contraction import Steepness, iterations_needed
+from ccnn_torch.compensation.machine import ASTRAY
+from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY, OUTPUTS, check_graph, open_onnx, run_onnx
 from ccnn_torch.compensation.routines import Copy, Functions, Statement, routines_of
+from ccnn_torch.compensation.targets.golden import Vectors, probe_points
+from ccnn_torch.compensation.targets.onnx_graph import Graph, Value
+from ccnn_torch.compensation.targets.onnx_operations import ByTensors
+from ccnn_torch.errors import MethodFailedError
+
+# Rows of an example, or a few more.
+_LEAST = 61
+
+
+def rows_apart_from(module: torch.nn.Module) -> int:
+    """How many rows an example has, so that a length is a multiple of them only where it grows with the batch."""
+    tensors = [*module.state_dict().values(), *module.buffers()]
+    lengths = {n for tensor in tensors for n in tensor.shape if n}
+    primes = (p for p in count(_LEAST) if all(p % d for d in range(2, math.isqrt(p) + 1)))
+    return next(p for p in primes if all(n % p for n in lengths))
+
+
+class Traced:
+    """A function of tensors whose first axis is the batch."""
+
+    def __init__(self, function: Callable[..., Any], *example: Tensor) -> None:
+        with torch.no_grad():
+            self._module = make_fx(lambda *given: function(*given), tracing_mode="real", pre_dispatch=True)(*example)
+
+    def __call__(self, graph: Graph, *inputs: Any) -> list[Any]:
+        """Write it into a graph; inputs and outputs are values or constants.
+
+        Raises:
+            MethodFailedError: there is an operation that no file has.
+        """
+        return ByTensors(graph).run(self._module, inputs)
+
 
 # What a machine falls back to where its last step went astray.
 _KEPT = (Copy("near_weight", "weight"), Copy("near_features", "features"))
@@ -214,3 +255,108 @@ def command_graph(
     model = graph.model({name: found[name] for name in outputs}, batch, "compensator")
     model.metadata_props.add(key=METADATA_KEY, value=metadata)
     return model
+
+
+_OPSET = 20
+_OPSET_FLOAT32 = 17
+# Of the correction limit: what a network may ask for, and what single precision gives.
+_LOOSEST = 1e-9
+_TOLERANCE_FLOAT32 = 1e-5
+_OUTPUTS_FLOAT32 = ("deviation", "guard", "back_deviation", "back_guard")
+
+
+def export_onnx(compensator: Compensator, metadata: str, outputs: Sequence[str] = OUTPUTS) -> bytes:
+    """The compensator in float64 as a verified ONNX file without external data, for any number of rows.
+
+    Inputs `joints` (`s x n`, ideal, SI) and, where there are any, `covariates` (`s x m`, SI). Outputs `command`,
+    `deviation`, `inside_domain`, for the way back `ideal` and `ideal_inside_domain`: the ideal joints, were the input a
+    command; and `deviation_sd`.
+
+    Args:
+        outputs: those that are wanted; each costs its own operations in every call.
+
+    Raises:
+        MethodFailedError: the file does not give the eager model's numbers, see `verify`, or cannot be run.
+    """
+    model = command_graph(compensator, _OPSET, metadata, outputs)
+    # What is read back must not be refused.
+    check_graph(model)
+    content: bytes = model.SerializeToString(deterministic=True)
+    try:
+        session = open_onnx(content)
+    except NoKernel as reason:
+        raise MethodFailedError(
+            f"an operator of this model has no kernel in ONNX Runtime in double ({str(reason).rpartition(' : ')[2]}); "
+            "leave out the learner or the effect (instrument on a machine that turns) that brings it"
+        ) from None
+    verify(compensator, lambda joints, covariates: run_onnx(session, joints, covariates), "ONNX", outputs)
+    return content
+
+
+def export_float32(compensator: Compensator, metadata: str) -> bytes:
+    """Single precision, one row, opset 17, for engines with a narrow operator list: a verified ONNX file.
+
+    Gemm, Sigmoid and elementwise operators only (Concat with covariates; sine and cosine with periodic inputs). A
+    joint of 1 m has a step of 1e-7 m in single precision, about the size of the corrections, so the file gives
+    deviations and the controller does the sums in its own precision: command = joints - `deviation`; the way back is
+    ideal = joints + `back_deviation`. `guard` and `back_guard` are 1 inside the domain and fall to 0 outside.
+
+    Raises:
+        MethodFailedError: the file is not right to 1e-5 of the limit, or the model holds physical effects or identified
+            kinematics, which are computed in double: a length of 1 m is rounded by as much as a deviation.
+    """
+    if compensator.effects is not None or compensator.machine is not None:
+        what = "identified kinematics" if compensator.effects is None else "physical effects"
+        raise MethodFailedError(f"the {what} need double precision; use the float64 file")
+    twin = copy.copy(compensator)
+    if not twin.secant:
+        twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
+    joints, covariates = probe_points(compensator)
+    given = [v.float() for v in (joints, covariates) if v is not None]
+    model = command_graph(twin, _OPSET_FLOAT32, metadata, _OUTPUTS_FLOAT32, "float32")
+    content: bytes = model.SerializeToString(deterministic=True)
+    session = open_onnx(content)
+    with torch.no_grad():
+        expected = compensator.guarded(*(v.double() for v in given))
+    tolerance = _TOLERANCE_FLOAT32 * compensator.limit.numpy()
+    for row in range(len(joints)):
+        one = [v[row : row + 1].numpy() for v in given]
+        found = run_onnx(session, one[0], one[1] if len(one) > 1 else None)
+        for name, wanted in zip(_OUTPUTS_FLOAT32, expected, strict=True):
+            allowed = 10 * _TOLERANCE_FLOAT32 if "guard" in name else tolerance
+            if not bool((np.abs(found[name].astype(np.float64) - wanted[row].numpy()) <= allowed).all()):
+                raise MethodFailedError(
+                    f"single precision does not hold this model: its output '{name}' is off by more than 1e-5 of the "
+                    "limit; use the float64 file"
+                )
+    return content
+
+
+def verify(compensator: Compensator, run: Any, form: str, outputs: Sequence[str] = OUTPUTS) -> None:
+    """Compare an exported form with the eager model, at random and at extreme points, one by one and in a batch.
+
+    Args:
+        run: (joints `s x n`, covariates `s x m` or None) -> outputs by name.
+        form: what the file is called in the error.
+        outputs: that there are.
+
+    Raises:
+        MethodFailedError: it differs by more than 1e-12 of the limit (commands: and the rounding of a joint; standard
+            deviations: and 1e-12 of themselves). A network may ask for more than 1e-12, up to 1e-9, by its attribute
+            `export_tolerance`; so may geometry, effects and machine.
+    """
+    joints, covariates = probe_points(compensator)
+    with torch.no_grad():
+        expected = compensator.solve(joints, covariates)._asdict()
+    given = joints.numpy(), None if covariates is None else covariates.numpy()
+    share = min(compensator.export_tolerance, _LOOSEST)
+    wanted = {name: value.numpy() for name, value in expected.items()}
+    vectors = Vectors(given[0], joints.numpy()[:, :0], wanted, share * compensator.most.numpy(), share)
+    for rows in (len(joints), 1):
+        found = run(*(None if v is None else v[:rows] for v in given))
+        wrong = [name for name, error in vectors.errors(found, outputs).items() if not error <= 1]
+        if wrong:
+            raise MethodFailedError(
+                f"the {form} export's output '{wrong[0]}' is not the model's to {share:.0e} of the limit; export with "
+                "other versions of torch or onnxruntime (tested ones: see the model card)"
+            )
