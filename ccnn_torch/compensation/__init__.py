@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from ccnn_torch.compensation.expansions import expand as expand
     from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
     from ccnn_torch.compensation.machine import Machine as Machine, Rule as Rule, build_machine as build_machine
-    from ccnn_torch.compensation.model_files.identified import (
-        IdentifiedGeometry as IdentifiedGeometry,
+    from ccnn_torch.compensation.model_files.identified import sign_model as sign_model
+    from ccnn_torch.compensation.model_files.load import (
+        LoadedModel as LoadedModel,
         load_compensation as load_compensation,
-        sign_model as sign_model,
+        load_model as load_model,
     )
-    from ccnn_torch.compensation.model_files.load import LoadedModel as LoadedModel, load_model as load_model
     from ccnn_torch.compensation.model_files.save import (
         FORMS as FORMS,
         card_name as card_name,
@@ -53,8 +53,8 @@ else:
             "expansions": "expand",
             "machine": "Machine Rule build_machine",
             "parts": "geometric_deviation machine_parts",
-            "model_files.identified": "IdentifiedGeometry load_compensation sign_model",
-            "model_files.load": "LoadedModel load_model",
+            "model_files.identified": "sign_model",
+            "model_files.load": "LoadedModel load_compensation load_model",
             "model_files.save": "FORMS card_name save_model",
             "model_files.signature": "new_key_pair",
             "networks": "UncertainNetwork network_from_description register_network",

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.compensation.contraction import spread_points
-from ccnn_torch.compensation.domain import Domain
+from ccnn_torch.compensation.domain import Domain, spread_points
 from ccnn_torch.errors import InputError, MethodFailedError
 
 _DEGREES = (2, 4, 6, 8, 10, 12, 16)

@@ -13,9 +13,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ccnn_torch.compensation.compensator import DAMPED
-from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry, load_compensation
-from ccnn_torch.compensation.model_files.load import LoadedModel
+from ccnn_torch.compensation.model_files.load import LoadedModel, load_compensation
+from ccnn_torch.compensation.routines import DAMPED
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError
 from ccnn_torch.files.read import parse_json, read_text
@@ -47,7 +46,7 @@ class WantedPoses:
 
     def __init__(
         self,
-        loaded: LoadedModel | IdentifiedGeometry,
+        loaded: LoadedModel,
         allow_code: bool = False,
         tool: Sequence[float] | None = None,
         base: Sequence[float] | None = None,
@@ -140,9 +139,9 @@ class WantedPoses:
         return torch.cat([found[:, :3, 3], matrix_to_rotation_vector(found[:, :3, :3])], -1)
 
 
-def _measured_tool(loaded: LoadedModel | IdentifiedGeometry, mechanism: Mechanism) -> Sequence[float]:
+def _measured_tool(loaded: LoadedModel, mechanism: Mechanism) -> Sequence[float]:
     """The tool's frame with which the model was made, x, y, z and rotation vector from the end of the last link."""
-    machine = loaded.identified if isinstance(loaded, IdentifiedGeometry) else mechanism
+    machine = mechanism if loaded.machine is None else loaded.machine.identified
     tool: list[float] = machine.nominal[-6:].tolist()
     return tool
 
@@ -206,7 +205,6 @@ def _reached(mechanism: Mechanism, joints: Tensor, poses: Tensor) -> Tensor:
 
 
 Array: TypeAlias = NDArray[Any]
-Model: TypeAlias = LoadedModel | IdentifiedGeometry
 
 _LARGEST = 500_000_000
 ROWS = 1024
@@ -269,7 +267,7 @@ def compensate_table(
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     poses = WantedPoses(loaded, allow_code, tool, base) if pose else None
     found = write_compensated(loaded, input, output, poses, back, sd)
-    said = sentences(output, found, trained=isinstance(loaded, LoadedModel))
+    said = sentences(output, found, trained=loaded.machine is None)
     if poses is not None and poses.chooses:
         said.append(poses.sentence)
     refused = (
@@ -281,7 +279,7 @@ def compensate_table(
 
 
 def write_compensated(
-    loaded: Model,
+    loaded: LoadedModel,
     input: Path,
     output: Path,
     poses: WantedPoses | None = None,
@@ -316,7 +314,7 @@ def write_compensated(
     return result
 
 
-def _joints(loaded: Model, table: Table, back: bool, shown: JointMap | None) -> tuple[Array, dict[str, str]]:
+def _joints(loaded: LoadedModel, table: Table, back: bool, shown: JointMap | None) -> tuple[Array, dict[str, str]]:
     """Joints `rows x n` [SI], and the unit of each as written."""
     own = [c.name for c in loaded.joints] if shown is None else shown.columns
     names = {c.name: column for c, column in zip(loaded.joints, own, strict=True)}
@@ -329,7 +327,7 @@ def _joints(loaded: Model, table: Table, back: bool, shown: JointMap | None) -> 
     return values if shown is None else shown.of_shown(values), units
 
 
-def _check_joint_columns(loaded: Model, table: Table) -> None:
+def _check_joint_columns(loaded: LoadedModel, table: Table) -> None:
     """Raise `InputError` for a file with more joints than the model; a missing one is reported when it is read."""
     known = {c.name for c in loaded.joints}
     other = [name for name in table.names if name[:1] == "q" and name[1:].isdigit() and name not in known]
@@ -342,7 +340,7 @@ def _check_joint_columns(loaded: Model, table: Table) -> None:
 
 
 def _added(
-    loaded: Model, found: dict[str, Array], units: dict[str, str], back: bool, sd: bool, shown: JointMap | None
+    loaded: LoadedModel, found: dict[str, Array], units: dict[str, str], back: bool, sd: bool, shown: JointMap | None
 ) -> dict[str, ArrayLike]:
     """The columns that OUT gets, in the units and in the count that the joints were written in."""
 

@@ -13,6 +13,19 @@ from ccnn_torch.compensation.expansions import ChebyshevExpansion
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
+# Of central differences of the fourth order [SI]: machines are about 1 m, and their kinematics are curved by about 1/m.
+_STEP = 5e-4
+# From a polynomial that is off by some hundredths at most, and by 1e-4 mostly.
+_NEWTON_STEPS = 4
+# What is left of the inverse kinematics where a pose was found [SI].
+_FOUND = 1e-9
+# How far a further step may move the pose of one that has settled [m, rad].
+_SETTLED = 1e-13
+# A Jacobian that is none, and from where on no machine has one [m or rad per joint unit].
+_LOST, _STEEPEST = 1e9, 1e6
+# Cosines of a right angle and their products with lengths: rounding [1 or m], and as zeros they cost nothing.
+_NOTHING = 1e-15
+
 
 def skew_vector(turn: Tensor) -> Tensor:
     """Vector of the skew part of `... x 3 x 3`, `... x 3`: sin(angle) times the axis of a rotation; of a rate of
@@ -43,16 +56,39 @@ def inverse(matrix: Tensor) -> Tensor:
     return gauss_jordan(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand_as(matrix))
 
 
-# Of central differences of the fourth order [SI]: machines are about 1 m, and their kinematics are curved by about 1/m.
-_STEP = 5e-4
-# From a polynomial that is off by some hundredths at most, and by 1e-4 mostly.
-_NEWTON_STEPS = 4
-# What is left of the inverse kinematics where a pose was found [SI].
-_FOUND = 1e-9
-# How far a further step may move the pose of one that has settled [m, rad].
-_SETTLED = 1e-13
-# A Jacobian that no machine has [m or rad per joint unit].
-_LOST = 1e9
+class Placed(NamedTuple):
+    """The frame of the pose, and its derivative.
+
+    Attributes:
+        position: `... x 3` [m].
+        rotation: `... x 3 x 3`; None where the pose has no orientation.
+        linear, turning: velocity and rate of rotation by each joint, base frame, `... x n x 3` [m, rad per joint unit].
+        lost: 1 where the machine has no such pose, else 0, `... x 1`; None where it has one everywhere.
+    """
+
+    position: Tensor
+    rotation: Tensor | None
+    linear: Tensor
+    turning: Tensor
+    lost: Tensor | None = None
+
+    def shifted(self, shift: Tensor) -> Placed:
+        """Moved by position and rotation vector `... x c` [m, rad] in the base frame; the derivative is kept.
+
+        The exponential of the rotation is its series, right to rounding below 0.3 rad.
+        """
+        position = self.position + shift[..., :3]
+        if self.rotation is None or shift.shape[-1] == 3:
+            return self._replace(position=position)
+        vector = shift[..., 3:]
+        zero = torch.zeros_like(vector[..., 0])
+        x, y, z = vector.unbind(-1)
+        skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*zero.shape, 3, 3)
+        square = (vector * vector).sum(-1)[..., None, None]
+        sine = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
+        cosine = (1 - square / 12 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))) / 2
+        rotation = self.rotation + (sine * skew + cosine * (skew @ skew)) @ self.rotation
+        return self._replace(position=position, rotation=rotation)
 
 
 class ClosedKinematics(nn.Module):
@@ -65,7 +101,7 @@ class ClosedKinematics(nn.Module):
         start: polynomial from which Newton's method finds the pose, where only the inverse kinematics are closed.
     """
 
-    def __init__(self, mechanism: Mechanism, start: ChebyshevExpansion | None) -> None:
+    def __init__(self, mechanism: Mechanism, start: ChebyshevExpansion | None = None) -> None:
         super().__init__()
         # In a tuple, since the mechanism's own buffers are no part of the model.
         self._mechanism = (mechanism,)
@@ -79,7 +115,7 @@ class ClosedKinematics(nn.Module):
         needed = self.start is not None or names & {"frame_slope", "holding", "visible"}
         seen = frame_slope(mechanism.frame, pose) if needed else pose
         if self.start is None:
-            found["jacobian"] = frame_slope(lambda q: mechanism.frame(mechanism.forward_kinematics(q)), joints)
+            found["jacobian"] = self._forward_slope(joints)
         else:
             found["jacobian"] = seen @ _pseudo_inverse(_slope(mechanism.solve_inverse, pose))
         if "parameter_jacobian" in names:
@@ -101,6 +137,28 @@ class ClosedKinematics(nn.Module):
         if "visible" in names:
             found["visible"] = seen @ _pseudo_inverse(seen)
         return found
+
+    def at(self, joints: Tensor) -> Placed:
+        """By forward kinematics at joints `... x n` [SI]; the home pose, which nothing moves, where there is none."""
+        lead = joints.shape[:-1]
+        stand, pose, there = self._standing(joints.reshape(-1, joints.shape[-1]))
+        position, rotation = self._mechanism[0].frame(pose)
+        rates = self._forward_slope(stand).mT
+        # At the edge of what it reaches a neighbour has no pose.
+        steep = torch.relu(rates.abs() - _STEEPEST).sum((-2, -1)).unsqueeze(-1)
+        there = torch.logical_and(there, steep <= 0)
+        rates = torch.where(there.unsqueeze(-1), rates, torch.zeros_like(rates))
+
+        def shaped(value: Tensor) -> Tensor:
+            return value.reshape(*lead, *value.shape[1:])
+
+        turned = None if rotation is None else shaped(rotation)
+        lost = torch.where(there, 0.0, 1.0)
+        return Placed(shaped(position), turned, shaped(rates[..., :3]), shaped(rates[..., 3:]), shaped(lost))
+
+    def _forward_slope(self, joints: Tensor) -> Tensor:
+        mechanism = self._mechanism[0]
+        return frame_slope(lambda q: mechanism.frame(mechanism.forward_kinematics(q)), joints)
 
     def standing(self, joints: Tensor, steps: int) -> tuple[Tensor, Tensor]:
         """Pose coordinates at joints `... x n`, `... x p` [SI], and whether it is theirs and not the home, `... x 1`.
@@ -189,92 +247,12 @@ def frame_slope(function: Callable[[Tensor], tuple[Tensor, Tensor | None]], poin
     rotation = function(point)[1]
     assert rotation is not None
     # The skew part of dR Rᵀ is the rotation vector's, and its second order is symmetric.
-    turn = rotations @ rotation.mT
-    skew = (turn - turn.mT) * torch.tensor(0.5, dtype=turn.dtype)
-    turned = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
-    return torch.cat([_difference(positions), _difference(turned)], -2)
+    return torch.cat([_difference(positions), _difference(skew_vector(rotations @ rotation.mT))], -2)
 
 
 def _pseudo_inverse(matrix: Tensor) -> Tensor:
     """Of `s x o x k` with independent columns, `s x k x o`."""
     return inverse(matrix.mT @ matrix) @ matrix.mT
-
-
-# A Jacobian that no machine has [m or rad per joint unit].
-_STEEPEST = 1e6
-
-
-class Placed(NamedTuple):
-    """The frame of the pose, and its derivative.
-
-    Attributes:
-        position: `... x 3` [m].
-        rotation: `... x 3 x 3`; None where the pose has no orientation.
-        linear, turning: velocity and rate of rotation by each joint, base frame, `... x n x 3` [m, rad per joint unit].
-        lost: 1 where the machine has no such pose, else 0, `... x 1`; None where it has one everywhere.
-    """
-
-    position: Tensor
-    rotation: Tensor | None
-    linear: Tensor
-    turning: Tensor
-    lost: Tensor | None = None
-
-    def shifted(self, shift: Tensor) -> Placed:
-        """Moved by position and rotation vector `... x c` [m, rad] in the base frame; the derivative is kept.
-
-        The exponential of the rotation is its series, right to rounding below 0.3 rad.
-        """
-        position = self.position + shift[..., :3]
-        if self.rotation is None or shift.shape[-1] == 3:
-            return self._replace(position=position)
-        vector = shift[..., 3:]
-        zero = torch.zeros_like(vector[..., 0])
-        x, y, z = vector.unbind(-1)
-        skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*zero.shape, 3, 3)
-        square = (vector * vector).sum(-1)[..., None, None]
-        sine = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
-        cosine = (1 - square / 12 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))) / 2
-        rotation = self.rotation + (sine * skew + cosine * (skew @ skew)) @ self.rotation
-        return self._replace(position=position, rotation=rotation)
-
-
-class ForwardForm(nn.Module):
-    """One geometry of a machine whose forward kinematics is a closed form; derivatives by central differences."""
-
-    values: Tensor
-
-    def __init__(self, mechanism: Mechanism, values: Tensor) -> None:
-        """values: all parameters, `k` [SI]."""
-        super().__init__()
-        self._mechanism = (mechanism,)
-        self.register_buffer("values", values.detach().clone(), persistent=False)
-
-    def at(self, joints: Tensor) -> Placed:
-        """At joints `... x n` [SI]; in its home pose, which nothing moves, where the machine has none."""
-        mechanism = self._mechanism[0]
-        rows = joints.reshape(-1, joints.shape[-1])
-        pose = mechanism.forward_kinematics(rows, self.values)
-        there = torch.isfinite(pose).all(-1, keepdim=True)
-        position, rotation = mechanism.frame(torch.where(there, pose, mechanism.home_pose))
-        stand = torch.where(there, rows, mechanism.home_joints)
-        rates = frame_slope(lambda q: mechanism.frame(mechanism.forward_kinematics(q, self.values)), stand).mT
-        # At the edge of what it reaches a neighbour has no pose.
-        steep = torch.relu(rates.abs() - _STEEPEST).sum((-2, -1)).unsqueeze(-1)
-        there = torch.logical_and(there, steep <= 0)
-        rates = torch.where(there.unsqueeze(-1), rates, torch.zeros_like(rates))
-        lead = joints.shape[:-1]
-
-        def shaped(value: Tensor) -> Tensor:
-            return value.reshape(*lead, *value.shape[1:])
-
-        turned = None if rotation is None else shaped(rotation)
-        lost = torch.where(there, 0.0, 1.0)
-        return Placed(shaped(position), turned, shaped(rates[..., :3]), shaped(rates[..., 3:]), shaped(lost))
-
-
-# Cosines of a right angle and their products with lengths: rounding [1 or m], and as zeros they cost nothing.
-_NOTHING = 1e-15
 
 
 class Links(nn.Module):
@@ -286,12 +264,11 @@ class Links(nn.Module):
     _slides: Tensor
     _turns: Tensor
 
-    def __init__(self, arm: Mechanism, values: Tensor) -> None:
-        """values: all parameters, frames included, `k` [SI]."""
+    def __init__(self, arm: Mechanism) -> None:
         super().__init__()
         assert isinstance(arm, SerialArm)
         self._turned = arm.orientation != "none"
-        links = _links(arm, values.detach())
+        links = _links(arm)
         spins, shifts = _screws(links)
         for name, value in {
             "_links": links,
@@ -317,11 +294,12 @@ class Links(nn.Module):
         return Placed(chain[-1][..., :3, 3], rotation, linear, spins)
 
 
-def _links(arm: SerialArm, values: Tensor) -> Tensor:
+def _links(arm: SerialArm) -> Tensor:
     """`cos q`, `sin q` (or q of a prismatic joint) and constant part of every link's transform, `3 x n x 4 x 4`.
 
     The base comes before the first link and the tool after the last one.
     """
+    values = arm.nominal
 
     def at(q: float) -> Tensor:
         joints = torch.full((len(arm.joints),), q, dtype=torch.float64)

@@ -12,7 +12,6 @@ from ccnn_torch.compensation.effects import PhysicalEffects
 from ccnn_torch.compensation.expansions import ChebyshevExpansion, expand
 from ccnn_torch.compensation.kinematics import (
     ClosedKinematics,
-    ForwardForm,
     Links,
     Placed,
     gauss_jordan,
@@ -160,9 +159,8 @@ class Machine(nn.Module):
         return {}
 
     def _prepare(self) -> None:
-        mechanism = self.mechanism
-        make = Links if isinstance(mechanism, SerialArm) else ForwardForm
-        self._nominal, self._identified = make(mechanism, mechanism.nominal), make(mechanism, self.identified)
+        make = Links if isinstance(self.mechanism, SerialArm) else ClosedKinematics
+        self._nominal, self._identified = make(self.mechanism), make(self.real)
 
     def _reached(self, moved: Tensor, covariates: Tensor) -> Placed:
         if self.effects is None:

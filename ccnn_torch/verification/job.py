@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
+from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.display import count_text
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.records import check_rows, load_records
@@ -32,7 +32,7 @@ _SUSPECT = 0.5
 
 
 def verify_model(
-    model: LoadedModel | IdentifiedGeometry,
+    model: LoadedModel,
     records: Any,
     mechanism: str | None = None,
     compensated: bool = False,

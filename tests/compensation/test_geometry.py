@@ -19,7 +19,7 @@ from ccnn_torch.compensation import (
     save_model,
 )
 from ccnn_torch.compensation.expansions import ChebyshevExpansion
-from ccnn_torch.compensation.model_files.onnx_session import check_graph, open_onnx
+from ccnn_torch.compensation.model_files.metadata import check_graph, open_onnx
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.mechanisms import Mechanism
 

@@ -64,7 +64,7 @@ def solved(made: Compensator, joints: Tensor, covariates: Tensor | None = None) 
 def reached(machine: Known, made: Compensator, command: Tensor, covariates: Tensor) -> Tensor:
     """Frame of the true machine, which is the identified one with what was learned, `s x c`."""
     learned = made.learned(command, covariates if made.covariates else None)
-    return machine.frame(command + learned, made._held(covariates))
+    return machine.frame(command + learned, made.held(covariates))
 
 
 def wanted(machine: Known, joints: Tensor) -> Tensor:

@@ -25,8 +25,8 @@ from torch import Tensor
 from ccnn_torch import export_model
 from ccnn_torch.compensation import Compensator
 from ccnn_torch.compensation.model_files.identified import load_geometry
-from ccnn_torch.compensation.model_files.onnx_session import open_onnx
-from ccnn_torch.compensation.targets import from_graph
+from ccnn_torch.compensation.model_files.metadata import open_onnx
+from ccnn_torch.compensation.targets import from_model
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of, traced_program
@@ -159,8 +159,8 @@ def test_structured_text_is_parsed_and_gives_the_numbers(kind: str, monkeypatch:
     dtype = "float32" if single else "float64"
     if arrays:
         # As in a large model, whose parser would take minutes.
-        monkeypatch.setattr(from_graph, "_ELEMENTS", 2)
-        monkeypatch.setattr(from_graph, "_PRODUCTS", 4)
+        monkeypatch.setattr(from_model, "_ELEMENTS", 2)
+        monkeypatch.setattr(from_model, "_PRODUCTS", 4)
     compensator.secant = arrays
     form, golden = made(compensator, dtype, sd=single)
     files = print_structured_text(form, golden)

@@ -8,8 +8,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry, load_compensation
-from ccnn_torch.compensation.model_files.load import LoadedModel
+from ccnn_torch.compensation.model_files.load import LoadedModel, load_compensation
 from ccnn_torch.compensation.model_files.save import model_contents
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
@@ -27,7 +26,7 @@ from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
 
 
-def print_robot(model: LoadedModel | IdentifiedGeometry) -> dict[str, str]:
+def print_robot(model: LoadedModel) -> dict[str, str]:
     """Contents of the files by name: `robot.urdf`, `robot.xml` (MJCF), and `robot.yaml` where the arm has a DH table.
 
     Raises:
@@ -38,12 +37,13 @@ def print_robot(model: LoadedModel | IdentifiedGeometry) -> dict[str, str]:
     return texts if arm.convention == "urdf" else texts | {"robot.yaml": dh_text(arm)}
 
 
-def _arm(model: LoadedModel | IdentifiedGeometry) -> SerialArm:
-    if isinstance(model, IdentifiedGeometry):
-        if isinstance(model.identified, SerialArm):
-            return model.identified
+def _arm(model: LoadedModel) -> SerialArm:
+    if model.machine is not None:
+        arm = model.machine.identified
+        if isinstance(arm, SerialArm):
+            return arm
         raise MethodFailedError(
-            f"a URDF is a tree, and '{model.identified.name}' is no serial arm; its parameters are in identified.yaml"
+            f"a URDF is a tree, and '{arm.name}' is no serial arm; its parameters are in identified.yaml"
         )
     machine = None if model.compensator is None else model.compensator.machine
     if machine is None or not isinstance(machine.mechanism, SerialArm):
@@ -66,14 +66,12 @@ class _Order:
     """What is to be exported, and how; the parts that targets need are made when they ask."""
 
     path: Path
-    model: LoadedModel | IdentifiedGeometry
+    model: LoadedModel
     dtype: str
     sd: bool
     allow_code: bool
 
     def compensator(self) -> Compensator:
-        if isinstance(self.model, IdentifiedGeometry):
-            return self.model.compensator
         if self.model.compensator is None:
             raise ModelFileError(f"{self.path}: an export is made of the master; give the .safetensors beside it")
         return self.model.compensator
@@ -92,13 +90,13 @@ class _Order:
     def source(self) -> str:
         name, file = self.model.facts["mechanism"].get("name") or "a machine", self.path.name
         told = f"{name}, written by ccnn_torch {__version__} from {file}"
-        if isinstance(self.model, LoadedModel):
+        if self.model.machine is None:
             return f"{told}, SHA-256 {self.model.card['files'][file]}"
         return told
 
     def mechanism(self) -> Mechanism:
-        if isinstance(self.model, IdentifiedGeometry):
-            return self.model.identified
+        if self.model.machine is not None:
+            return self.model.machine.identified
         described = self.model.facts["mechanism"]
         if "spec" not in described:
             raise ModelFileError(f"{self.path}: this target needs the machine's kinematics, which the model lacks")
@@ -106,26 +104,24 @@ class _Order:
 
 
 def _linuxcnc(order: _Order) -> dict[str, str]:
-    form = None if isinstance(order.model, IdentifiedGeometry) else order.proven()[0]
+    form = order.proven()[0] if order.model.machine is None else None
     return print_linuxcnc(form, order.mechanism(), order.source())
 
 
 def _onnx(order: _Order) -> dict[str, bytes | str]:
     compensator, model = order.compensator(), order.model
-    if isinstance(model, IdentifiedGeometry):
+    fields = model.card
+    if model.machine is not None:
         # Nothing was measured for this file but what identified the machine.
         digest = sha256(order.path.read_bytes()).hexdigest()
-        read = {"columns": model.columns, "joint_map": model.joint_map}
-        fields = model.facts | read | {"metrics": {}, "data_sha256": digest, "seed": 0}
-    else:
-        fields = model.card
+        fields = model.facts | fields | {"metrics": {}, "data_sha256": digest, "seed": 0}
     contents = model_contents(compensator, fields, forms=("onnx", "float32.onnx"))
     return dict(contents.values()) | {"controller.onnx": export_onnx(compensator, "{}", COMMAND)}
 
 
 def _table(order: _Order) -> dict[str, str]:
-    if isinstance(order.model, IdentifiedGeometry):
-        return print_tables(order.compensator(), order.model.nominal)
+    if order.model.machine is not None:
+        return print_tables(order.compensator(), order.model.machine.nominal)
     known = "spec" in order.model.facts["mechanism"]
     return print_tables(order.compensator(), order.mechanism() if known else None)
 

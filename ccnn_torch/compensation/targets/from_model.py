@@ -14,7 +14,7 @@ from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.contraction import Steepness, iterations_needed
+from ccnn_torch.compensation.fit import Steepness, iterations_needed
 from ccnn_torch.compensation.lowering import Lowering, operation_of
 from ccnn_torch.compensation.routines import ControllerFunctions, Routine, routines_of
 from ccnn_torch.compensation.targets.build import Builder
@@ -183,8 +183,12 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     if sd:
         about = "Standard deviation of a newly measured deviation at a command, model and noise."
         routines.append(Routine("deviation_sd", about, "command", ("sd",), ("clean", "spread")))
-    functions = ControllerFunctions(own, _SLACK[dtype], dtype)
+    functions, examples = ControllerFunctions(own, _SLACK[dtype], dtype), dict[str, Tensor]()
     names = dict.fromkeys(name for routine in routines for name, _ in routine.calls)
+    with torch.no_grad():
+        for routine in routines:
+            examples |= functions.run(routine.statements, functions.start(own.domain.centre.unsqueeze(0)))
+    read = {key for routine in routines for key in routine.read}.union(*map(functions.inputs_of, names))
     way = "the fixed point" if own.machine is None else "Gauss and Newton's method"
     return Form(
         [c.header for c in own.joints],
@@ -194,24 +198,28 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
         own.most.numpy(),
         own.fallback_sd.numpy(),
         dtype,
-        {name: _program(functions, name) for name in names},
+        {name: _program(functions, name, examples, read) for name in names},
         {routine.name: routine for routine in routines},
     )
 
 
-def _program(functions: ControllerFunctions, name: str) -> Program:
-    """One of the functions; variables without numbers are left out, as covariates where there are none."""
+def _program(functions: ControllerFunctions, name: str, values: dict[str, Tensor], read: set[str]) -> Program:
+    """One of the functions; variables without numbers are left out, as covariates where there are none.
+
+    Args:
+        values: an example of every variable.
+        read: variables that something reads.
+    """
     every = functions.inputs_of(name)
     # A tensor of its own for each: the tracer takes equal tensors for one input.
-    examples = {i: functions.examples[i].clone() for i in every if functions.examples[i].numel()}
-    nothing = torch.zeros(1, 0, dtype=torch.float64)
+    examples = {i: values[i].clone() for i in every if values[i].numel()}
+    outputs = [key for key in functions.call(name, values) if key in read]
 
-    def called(*values: Tensor) -> Sequence[Tensor]:
-        given = dict(zip(examples, values, strict=True))
-        found: Sequence[Tensor] = getattr(functions, name)(*(given.get(i, nothing) for i in every))
-        return found
+    def called(*given: Tensor) -> Sequence[Tensor]:
+        found = functions.call(name, values | dict(zip(examples, given, strict=True)))
+        return [found[key] for key in outputs]
 
-    return traced_program(called, [*examples.values()], name, [*examples], functions.outputs[name].split())
+    return traced_program(called, [*examples.values()], name, [*examples], outputs)
 
 
 def traced_program(

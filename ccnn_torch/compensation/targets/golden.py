@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation.compensator import DAMPED, Compensator
-from ccnn_torch.compensation.contraction import TOLERANCE
-from ccnn_torch.compensation.routines import Copy, Statement
+from ccnn_torch.compensation.compensator import TOLERANCE, Compensator
+from ccnn_torch.compensation.routines import DAMPED, execute
 from ccnn_torch.compensation.targets.form import OPERATIONS, Array, Expression, Form, Leaf, Let, Program
 from ccnn_torch.compensation.targets.from_model import SINGLE_TOLERANCE
 from ccnn_torch.errors import MethodFailedError
@@ -165,19 +164,14 @@ def run_routine(form: Form, name: str, joints: Array, covariates: Array) -> dict
     routine = form.routines[name]
     values = {"given": joints, "covariates": covariates}
 
-    def run(statements: Sequence[Statement]) -> None:
-        for statement in statements:
-            if isinstance(statement, str):
-                program = form.programs[statement]
-                values.update(run_program(program, {key: values[key] for key in program.inputs}, form.dtype))
-            elif isinstance(statement, Copy):
-                zeros = np.zeros((len(joints), form.sizes[statement.target]), form.dtype)
-                values[statement.target] = values[statement.source] if statement.source else zeros
-            else:
-                for _ in range(statement.times):
-                    run(statement.statements)
+    def call(called: str, values: dict[str, Array]) -> dict[str, Array]:
+        program = form.programs[called]
+        return run_program(program, {key: values[key] for key in program.inputs}, form.dtype)
 
-    run(routine.statements)
+    def zeros(variable: str) -> Array:
+        return np.zeros((len(joints), form.sizes[variable]), form.dtype)
+
+    execute(routine.statements, values, call, zeros)
     return {key: values[key] for key in routine.returns} | {"status": values["status"][:, 0].astype(int)}
 
 
