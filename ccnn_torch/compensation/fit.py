@@ -15,7 +15,7 @@ from ccnn_torch.compensation.domain import POINTS, Domain, spread_points
 from ccnn_torch.compensation.effects import PhysicalEffects
 from ccnn_torch.compensation.expansions import ChebyshevExpansion
 from ccnn_torch.compensation.machine import ASTRAY, FARTHEST, Machine
-from ccnn_torch.compensation.routines import Functions, Step, next_correction, next_step, routines_of
+from ccnn_torch.compensation.routines import Functions, Variables, next_step, routines_of
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.training import Scaling
@@ -40,6 +40,10 @@ _COUNTED = 512
 _MOST_STEPS, _DOUBLINGS, _FAR, _FEW = 12, 3, 0.5, 1e-3
 # Of the largest deviation in and around the domain: what the whole deviation may be.
 _ROOM = 1.5
+
+
+# Share of the limit to which single precision is right.
+SINGLE_TOLERANCE = 1e-5
 
 
 class Steepness(NamedTuple):
@@ -111,6 +115,11 @@ def iterations_needed(found: Steepness, tolerance: float = TOLERANCE) -> int:
     exact = math.log(tolerance / found.largest) / math.log(found.lipschitz)
     # A slope of exactly 1e-4 takes 3 steps, also where the quotient of the logarithms comes out as 3 + 4e-16.
     return max(1, math.ceil(exact - 1e-9))
+
+
+def single_steps(compensator: Compensator) -> int:
+    """Steps of the fixed point after which single precision shows no more."""
+    return iterations_needed(Steepness(compensator.lipschitz, 1.0), SINGLE_TOLERANCE / 10)
 
 
 def fit_compensator(
@@ -212,18 +221,27 @@ def fit_compensator(
     )
 
 
+@torch.no_grad()
 def _accelerate(compensator: Compensator, inputs: Tensor) -> None:
-    """Let Broyden's method find the command where that takes fewer steps; inputs: training inputs, `s x (n + m)`."""
-    if compensator.iterations <= _GENTLE_STEPS:
+    """Let Broyden's method find the command where that takes fewer steps; inputs: training inputs, `s x (n + m)`.
+
+    Steps are counted until d = δ(q - d) holds at points in and around the domain, to what exports are right to and the
+    rounding of a command.
+    """
+    most = compensator.iterations
+    if most <= _GENTLE_STEPS:
         return
+    compensator.secant = True
     points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED)
-    n = len(compensator.joints)
-    steps = secant_steps(
-        lambda joints: compensator.deviation(joints, points[:, n:] if compensator.covariates else None),
-        points[:, :n], compensator.limit, compensator.iterations, compensator.export_tolerance,
-    )  # fmt: skip
-    compensator.secant = steps < compensator.iterations
-    compensator.iterations = steps
+    functions, values = _begun(compensator, points, most)
+    rounding = torch.finfo(points.dtype).eps * values["q"].abs()
+    allowed = compensator.export_tolerance * compensator.limit + rounding
+    for count in range(1, most):
+        functions.run(next_step(compensator), values)
+        if bool(((values["found"] - values["correction"]).abs() <= allowed).all()):
+            compensator.iterations = count
+            return
+    compensator.secant = False
 
 
 @torch.no_grad()
@@ -273,35 +291,17 @@ def _enough(shares: list[float]) -> int:
 
 def _settling(compensator: Compensator, inputs: Tensor) -> tuple[list[float], Tensor, Tensor]:
     """Share of the regular rows that have not settled after each step, and the last correction with its doubt."""
-    functions, shares = Functions(compensator, _MOST_STEPS), list[float]()
-    start, again = routines_of(compensator)[0].statements, next_step(compensator)
-    values = functions.run(start[: start.index("step") + 1], functions.start(inputs))
+    (functions, values), shares = _begun(compensator, inputs, _MOST_STEPS), list[float]()
     regular = values["aim"][:, -1] <= 0
     for _ in range(_MOST_STEPS):
-        functions.run(again, values)
+        functions.run(next_step(compensator), values)
         shares.append(float((values["doubt"][regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
         if shares[-1] == 0:
             break
     return shares, values["correction"], values["doubt"]
 
 
-@torch.no_grad()
-def secant_steps(deviation: Callable[[Tensor], Tensor], joints: Tensor, limit: Tensor, most: int, near: float) -> int:
-    """The fewest steps after which d = δ(q - d) holds at all of these joints; `most` where no fewer suffice.
-
-    Args:
-        deviation: commanded joints `s x n` -> δ `s x n` [SI].
-        joints: `s x n` [SI].
-        limit: of |δ|, `n` [SI].
-        most: steps that are too many.
-        near: how far d and δ may be apart, as a share of the limit; the rounding of a command is allowed for.
-    """
-    found = deviation(joints)
-    correction, steps = torch.zeros_like(found), list[Step]()
-    allowed = near * limit + torch.finfo(joints.dtype).eps * joints.abs()
-    for count in range(1, most):
-        correction, steps = next_correction(found, correction, steps, limit)
-        found = deviation(joints - correction)
-        if bool(((found - correction).abs() <= allowed).all()):
-            return count
-    return most
+def _begun(compensator: Compensator, inputs: Tensor, most: int) -> tuple[Functions, Variables]:
+    """Functions with room for so many steps, and variables of inputs `s x (n + m)` [SI] after the first evaluation."""
+    functions, start = Functions(compensator, most), routines_of(compensator)[0].statements
+    return functions, functions.run(start[: start.index("step") + 1], functions.start(inputs))

@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike
 from ccnn_torch.compensation.compensator import Compensator, Hook
 from ccnn_torch.compensation.machine import FARTHEST
 from ccnn_torch.compensation.model_files.metadata import (
-    MACHINE_FORMS,
-    MODEL_FORMS,
     RUN_ERRORS,
     TAKE_AGAIN,
     Array,
@@ -26,7 +24,6 @@ from ccnn_torch.compensation.model_files.metadata import (
     coordinates,
     description_of,
     open_model,
-    read_model,
     run_onnx,
     said,
 )
@@ -37,6 +34,7 @@ from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError, raise
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.plugins import code_refused
 
+MODEL_FORMS, MACHINE_FORMS = (".safetensors", ".onnx"), (".yaml", ".yml", ".json")
 # From here an input counts as infinite; as in a `Domain`, but for the joints of a machine.
 _HUGE = 1e300
 # Of the limit: how far command + deviation may be from the joints, and of the half range: from the domain's edge.
@@ -379,6 +377,31 @@ class LoadedModel:
         if self.compensator is None:
             raise ModelFileError(f"{self.path}: a torch hook needs the master file; load the .safetensors beside it")
         return self.compensator.hook()
+
+
+def read_model(path: Path) -> bytes:
+    """The file's bytes.
+
+    Raises:
+        ModelFileError: its name is of another kind of file, it cannot be read, or is empty.
+    """
+    if path.suffix == ".pt2":
+        raise ModelFileError(
+            f"{path}: a .pt2 is never read back, because opening one can run code that it contains; give the "
+            ".safetensors or .onnx beside it, or, if you trust its author, open it yourself in Python: "
+            f"torch.export.load({str(path)!r}).module()"
+        )
+    if path.suffix not in MODEL_FORMS:
+        raise ModelFileError(f"{path}: a model file ends in {' or '.join(MODEL_FORMS)}, not in '{path.suffix}'")
+    if path.exists() and not path.is_file():
+        raise ModelFileError(f"{path}: is no file; give a {' or '.join(MODEL_FORMS)}")
+    try:
+        content = path.read_bytes()
+    except OSError as reason:
+        raise ModelFileError(f"{path}: cannot be read: {reason.strerror}; give a {' or '.join(MODEL_FORMS)}") from None
+    if not content:
+        raise ModelFileError(f"{path}: the file is empty; take it again from where it was written")
+    return content
 
 
 def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_code: bool = False) -> LoadedModel:

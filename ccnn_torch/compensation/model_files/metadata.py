@@ -33,7 +33,6 @@ Array = NDArray[Any]
 # How sentences about a touched file end.
 TAKE_AGAIN = "; take it again from where it was written"
 
-MODEL_FORMS, MACHINE_FORMS = (".safetensors", ".onnx"), (".yaml", ".yml", ".json")
 METADATA_KEY = "ccnn_torch"
 OUTPUTS = (
     *("command", "deviation", "inside_domain", "ideal", "ideal_inside_domain", "deviation_sd"),
@@ -444,31 +443,6 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
         made("machine"),
         tensors["most"],
     )
-
-
-def read_model(path: Path) -> bytes:
-    """The file's bytes.
-
-    Raises:
-        ModelFileError: its name is of another kind of file, it cannot be read, or is empty.
-    """
-    if path.suffix == ".pt2":
-        raise ModelFileError(
-            f"{path}: a .pt2 is never read back, because opening one can run code that it contains; give the "
-            ".safetensors or .onnx beside it, or, if you trust its author, open it yourself in Python: "
-            f"torch.export.load({str(path)!r}).module()"
-        )
-    if path.suffix not in MODEL_FORMS:
-        raise ModelFileError(f"{path}: a model file ends in {' or '.join(MODEL_FORMS)}, not in '{path.suffix}'")
-    if path.exists() and not path.is_file():
-        raise ModelFileError(f"{path}: is no file; give a {' or '.join(MODEL_FORMS)}")
-    try:
-        content = path.read_bytes()
-    except OSError as reason:
-        raise ModelFileError(f"{path}: cannot be read: {reason.strerror}; give a {' or '.join(MODEL_FORMS)}") from None
-    if not content:
-        raise ModelFileError(f"{path}: the file is empty; take it again from where it was written")
-    return content
 
 
 def card_of(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:

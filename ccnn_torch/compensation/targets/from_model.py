@@ -14,7 +14,7 @@ from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.fit import Steepness, iterations_needed
+from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
 from ccnn_torch.compensation.lowering import Lowering, operation_of
 from ccnn_torch.compensation.routines import ControllerFunctions, Routine, routines_of
 from ccnn_torch.compensation.targets.build import Builder
@@ -156,8 +156,6 @@ class _ByElements(Lowering):
         return self.ids(value) if alone else self.builder.table(value)
 
 
-# Share of the limit to which single precision is right.
-SINGLE_TOLERANCE = 1e-5
 # As in the check of every other model file: what is left of command + deviation = joints, as a share of the limit.
 _SLACK = {"float64": 1e-6, "float32": SINGLE_TOLERANCE}
 # From here a number counts as infinite where single precision has no 1e300.
@@ -178,7 +176,7 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     if dtype == "float32":
         own.domain.huge.clamp_(max=_HUGE_SINGLE)
         if not own.secant:
-            own.iterations = iterations_needed(Steepness(own.lipschitz, 1.0), SINGLE_TOLERANCE / 10)
+            own.iterations = single_steps(own)
     routines = routines_of(own)
     if sd:
         about = "Standard deviation of a newly measured deviation at a command, model and noise."
@@ -187,7 +185,7 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     names = dict.fromkeys(name for routine in routines for name, _ in routine.calls)
     with torch.no_grad():
         for routine in routines:
-            examples |= functions.run(routine.statements, functions.start(own.domain.centre.unsqueeze(0)))
+            examples = functions.run(routine.statements, functions.start(own.domain.centre.unsqueeze(0))) | examples
     read = {key for routine in routines for key in routine.read}.union(*map(functions.inputs_of, names))
     way = "the fixed point" if own.machine is None else "Gauss and Newton's method"
     return Form(

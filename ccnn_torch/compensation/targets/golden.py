@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.compensation.compensator import TOLERANCE, Compensator
+from ccnn_torch.compensation.fit import SINGLE_TOLERANCE
 from ccnn_torch.compensation.routines import DAMPED, execute
 from ccnn_torch.compensation.targets.form import OPERATIONS, Array, Expression, Form, Leaf, Let, Program
-from ccnn_torch.compensation.targets.from_model import SINGLE_TOLERANCE
 from ccnn_torch.errors import MethodFailedError
 
 # Near a singular pose rounding grows: what is allowed there, in units of what is allowed elsewhere.

@@ -17,10 +17,11 @@ import onnx
 import torch
 from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKernel
 from torch import Tensor
+from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.fit import Steepness, iterations_needed
+from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
 from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, OUTPUTS, check_graph, open_onnx, run_onnx
 from ccnn_torch.compensation.routines import KEPT, Functions, execute, routines_of
 from ccnn_torch.compensation.targets.golden import Vectors, probe_points
@@ -40,20 +41,10 @@ def rows_apart_from(module: torch.nn.Module) -> int:
     return next(p for p in primes if all(n % p for n in lengths))
 
 
-class Traced:
-    """A function of tensors whose first axis is the batch."""
-
-    def __init__(self, function: Callable[..., Any], *example: Tensor) -> None:
-        with torch.no_grad():
-            self._module = make_fx(lambda *given: function(*given), tracing_mode="real", pre_dispatch=True)(*example)
-
-    def __call__(self, graph: Graph, *inputs: Any) -> list[Any]:
-        """Write it into a graph; inputs and outputs are values or constants.
-
-        Raises:
-            MethodFailedError: there is an operation that no file has.
-        """
-        return ByTensors(graph).run(self._module, inputs)
+def traced(function: Callable[..., Any], *example: Tensor) -> GraphModule:
+    """A function of tensors whose first axis is the batch, by running it."""
+    with torch.no_grad():
+        return make_fx(lambda *given: function(*given), tracing_mode="real", pre_dispatch=True)(*example)
 
 
 # In the graph their numbers are there, so that command + deviation is the joints to the last digit.
@@ -105,7 +96,8 @@ def command_graph(
         # No linear form: an infinite number times 0 would be none.
         names = [given.name, graph.input("covariates", m, batch).name]
         given = graph.node("Concat", names, (rows, n + m), (rows, n + m), axis=1)
-    traced: dict[tuple[str, int], tuple[Traced, list[str]]] = {}
+    lowering = ByTensors(graph)
+    known: dict[tuple[str, int], tuple[GraphModule, list[str]]] = {}
 
     def call(name: str, values: dict[str, Any]) -> dict[str, Any]:
         inputs = {i: values[i] for i in functions.inputs_of(name)}
@@ -113,15 +105,15 @@ def command_graph(
             inputs |= {i: graph.solid(v) for i, v in inputs.items() if i in _SOLID and isinstance(v, Value)}
         # Steps of Broyden's method become more.
         key = name, values["steps"].shape[-1] if name == "following" else 0
-        if key not in traced:
+        if key not in known:
             steps = {"steps": torch.zeros(rows, key[1], dtype=torch.float64)}
             # A tensor of its own for each: the tracer takes equal tensors for one input.
             own = [(examples | steps)[i].clone() for i in inputs]
             with torch.no_grad():
                 given = [*getattr(functions, name)(*own)]
-            traced[key] = Traced(lambda *v: [*getattr(functions, name)(*v).values()], *own), given
-        module, given = traced[key]
-        return dict(zip(given, module(graph, *inputs.values()), strict=True))
+            known[key] = traced(lambda *v: [*getattr(functions, name)(*v).values()], *own), given
+        module, given = known[key]
+        return dict(zip(given, lowering.run(module, [*inputs.values()]), strict=True))
 
     def zeros(name: str) -> Tensor:
         return nothing if name == "steps" else torch.zeros(rows, n, dtype=torch.float64)
@@ -136,9 +128,8 @@ def command_graph(
 
 _OPSET = 20
 _OPSET_FLOAT32 = 17
-# Of the correction limit: what a network may ask for, and what single precision gives.
+# Of the correction limit: what a network may ask for.
 _LOOSEST = 1e-9
-_TOLERANCE_FLOAT32 = 1e-5
 _OUTPUTS_FLOAT32 = ("deviation", "guard", "back_deviation", "back_guard")
 
 
@@ -187,7 +178,7 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
         raise MethodFailedError(f"the {what} need double precision; use the float64 file")
     twin = copy.copy(compensator)
     if not twin.secant:
-        twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
+        twin.iterations = single_steps(compensator)
     joints, covariates = probe_points(compensator)
     given = [v.float() for v in (joints, covariates) if v is not None]
     model = command_graph(twin, _OPSET_FLOAT32, metadata, _OUTPUTS_FLOAT32, "float32")
@@ -195,12 +186,12 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     session = open_onnx(content)
     with torch.no_grad():
         expected = compensator.guarded(*(v.double() for v in given))
-    tolerance = _TOLERANCE_FLOAT32 * compensator.limit.numpy()
+    tolerance = SINGLE_TOLERANCE * compensator.limit.numpy()
     for row in range(len(joints)):
         one = [v[row : row + 1].numpy() for v in given]
         found = run_onnx(session, one[0], one[1] if len(one) > 1 else None)
         for name, wanted in zip(_OUTPUTS_FLOAT32, expected, strict=True):
-            allowed = 10 * _TOLERANCE_FLOAT32 if "guard" in name else tolerance
+            allowed = 10 * SINGLE_TOLERANCE if "guard" in name else tolerance
             if not bool((np.abs(found[name].astype(np.float64) - wanted[row].numpy()) <= allowed).all()):
                 raise MethodFailedError(
                     f"single precision does not hold this model: its output '{name}' is off by more than 1e-5 of the "
