@@ -28,10 +28,10 @@ from kinds import KINDS  # noqa: E402
 from structured_text import Instance, parse_blocks  # noqa: E402
 
 from ccnn_torch.compensation import Compensator, load_model  # noqa: E402
-from ccnn_torch.compensation.export.export import export_float32, export_onnx  # noqa: E402
 from ccnn_torch.compensation.targets.c99 import print_c99  # noqa: E402
 from ccnn_torch.compensation.targets.from_model import form_of  # noqa: E402
 from ccnn_torch.compensation.targets.golden import golden_vectors, require_equal  # noqa: E402
+from ccnn_torch.compensation.targets.onnx_export import export_float32, export_onnx  # noqa: E402
 from ccnn_torch.compensation.targets.structured_text import print_structured_text  # noqa: E402
 from ccnn_torch.errors import MethodFailedError  # noqa: E402
 

@@ -33,12 +33,12 @@ from kinds import masked  # noqa: E402
 from benchmarks.command import session  # noqa: E402
 from benchmarks.measure import Row  # noqa: E402
 from ccnn_torch.compensation import Compensator, load_model  # noqa: E402
-from ccnn_torch.compensation.export.export import export_onnx  # noqa: E402
-from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS  # noqa: E402
+from ccnn_torch.compensation.model_files.metadata import OUTPUTS  # noqa: E402
 from ccnn_torch.compensation.targets.c99 import print_c99  # noqa: E402
 from ccnn_torch.compensation.targets.export import COMMAND  # noqa: E402
 from ccnn_torch.compensation.targets.from_model import form_of  # noqa: E402
 from ccnn_torch.compensation.targets.golden import golden_vectors, require_equal  # noqa: E402
+from ccnn_torch.compensation.targets.onnx_export import export_onnx  # noqa: E402
 from ccnn_torch.errors import MethodFailedError  # noqa: E402
 
 # In each round every way follows the trajectory once.

@@ -1,6 +1,7 @@
 """The frozen schemas of result files, `contracts/*.json`: outsiders script against these files.
 
-Those of the models of `ccnn_torch/report/results/` are derived. After a key was added, write them again with
+Those of the models of `ccnn_torch/report/results/`, and of the card in `compensation/model_files/`, are derived.
+After a key was added, write them again with
 
     python tests/frozen.py
 
@@ -17,6 +18,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
+from ccnn_torch.compensation.model_files.metadata import Card
 from ccnn_torch.report.results.base import Result
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
 from ccnn_torch.report.results.identified import IdentifiedResults
@@ -25,7 +29,8 @@ from ccnn_torch.report.results.suite import SuiteResults
 from ccnn_torch.report.results.verify import VerifyResults
 
 FOLDER = Path(__file__).parent / "contracts"
-MODELS: dict[str, type[Result]] = {
+MODELS: dict[str, type[BaseModel]] = {
+    "card": Card,
     "results": RunResults,
     "identified": IdentifiedResults,
     "diagnosis": DiagnosisResults,
@@ -40,7 +45,7 @@ def frozen(name: str) -> dict[str, Any]:
     return found
 
 
-def derived(model: type[Result]) -> dict[str, Any]:
+def derived(model: type[BaseModel]) -> dict[str, Any]:
     """A model's schema, with the texts that document its fields."""
     schema = model.model_json_schema()
     texts = {name: text for part in _models(model) for name, text in _texts(part)}
@@ -85,15 +90,15 @@ def _target(schema: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
     return schema["$defs"][node["$ref"].rpartition("/")[2]] | {k: v for k, v in node.items() if k != "$ref"}
 
 
-def _models(model: type[Result]) -> Iterator[type[Result]]:
+def _models(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
     """All models of its module and of the base."""
     for module in (sys.modules[model.__module__], sys.modules[Result.__module__]):
         for part in vars(module).values():
-            if inspect.isclass(part) and issubclass(part, Result):
+            if inspect.isclass(part) and issubclass(part, BaseModel) and part is not BaseModel:
                 yield part
 
 
-def _texts(model: type[Result]) -> Iterator[tuple[str, str]]:
+def _texts(model: type[BaseModel]) -> Iterator[tuple[str, str]]:
     """`Model.key` and the text below the field."""
     body = ast.parse(inspect.getsource(model)).body[0]
     assert isinstance(body, ast.ClassDef)

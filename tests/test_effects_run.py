@@ -22,7 +22,7 @@ from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
-from ccnn_torch.compensation.model_files.onnx_session import open_onnx
+from ccnn_torch.compensation.model_files.metadata import open_onnx
 from ccnn_torch.compensation.networks import describe_network, network_from_description
 from ccnn_torch.diagnosis.from_file import Verdict, read_verdict
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, measured_pose, reached

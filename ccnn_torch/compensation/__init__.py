@@ -10,27 +10,22 @@ if TYPE_CHECKING:
         default_limit as default_limit,
     )
     from ccnn_torch.compensation.domain import Domain as Domain
-    from ccnn_torch.compensation.effects.effects import (
+    from ccnn_torch.compensation.effects import (
         Care as Care,
         PhysicalEffects as PhysicalEffects,
         effect_deviation as effect_deviation,
         expand_effects as expand_effects,
         gains as gains,
     )
+    from ccnn_torch.compensation.expansions import expand as expand
     from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
-    from ccnn_torch.compensation.geometry.chebyshev import expand as expand
-    from ccnn_torch.compensation.machine.inverse import build_machine as build_machine
-    from ccnn_torch.compensation.machine.machine import Machine as Machine, Rule as Rule
-    from ccnn_torch.compensation.machine.parts import (
-        geometric_deviation as geometric_deviation,
-        machine_parts as machine_parts,
-    )
-    from ccnn_torch.compensation.model_files.identified import (
-        IdentifiedGeometry as IdentifiedGeometry,
+    from ccnn_torch.compensation.machine import Machine as Machine, Rule as Rule, build_machine as build_machine
+    from ccnn_torch.compensation.model_files.identified import sign_model as sign_model
+    from ccnn_torch.compensation.model_files.load import (
+        LoadedModel as LoadedModel,
         load_compensation as load_compensation,
-        sign_model as sign_model,
+        load_model as load_model,
     )
-    from ccnn_torch.compensation.model_files.load import LoadedModel as LoadedModel, load_model as load_model
     from ccnn_torch.compensation.model_files.save import (
         FORMS as FORMS,
         card_name as card_name,
@@ -41,6 +36,10 @@ if TYPE_CHECKING:
         UncertainNetwork as UncertainNetwork,
         network_from_description as network_from_description,
         register_network as register_network,
+    )
+    from ccnn_torch.compensation.parts import (
+        geometric_deviation as geometric_deviation,
+        machine_parts as machine_parts,
     )
     from ccnn_torch.compensation.targets.export import export_model as export_model
 else:

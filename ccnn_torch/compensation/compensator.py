@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.compensation.contraction import TOLERANCE
 from ccnn_torch.compensation.domain import Domain
-from ccnn_torch.compensation.effects.effects import PhysicalEffects
-from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
-from ccnn_torch.compensation.machine.machine import ASTRAY, SETTLED, Machine
+from ccnn_torch.compensation.effects import PhysicalEffects
+from ccnn_torch.compensation.expansions import ChebyshevExpansion
+from ccnn_torch.compensation.machine import Machine
 from ccnn_torch.compensation.networks import UncertainNetwork
-from ccnn_torch.compensation.secant import Step, next_correction
+from ccnn_torch.compensation.routines import KEPT, Functions, Learned, Variables, routines_of
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, OutsideDomainWarning
 from ccnn_torch.training import Scaling
 
+# What is left of the equation q + δ(q) = q*, as a share of the limit.
+TOLERANCE = 1e-12
+
 Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
-
-
-EXACT, OUTSIDE, NOT_FINITE, DAMPED = range(4)
-"""Status of a command: exact; outside what was measured; an input is not finite, and the command is the joints; damped
-near a singular pose, at a limit or not settled, and the command is the nearest safe one."""
 
 
 class Solution(NamedTuple):
@@ -49,31 +47,6 @@ class Solution(NamedTuple):
     deviation_sd: Tensor
     status: Tensor
     ideal_status: Tensor
-
-
-class _Learned(NamedTuple):
-    """δ `... x n` [SI]; its weight against the safe correction, and the guard's excess, `... x 1` [1] each; and the
-    network's features there, `... x i` [1]."""
-
-    value: Tensor
-    weight: Tensor
-    excess: Tensor
-    features: Tensor
-
-    @property
-    def inside(self) -> Tensor:
-        """Whether inside the domain, `...`, bool."""
-        return self.excess.squeeze(-1) <= 0
-
-
-class _Way(NamedTuple):
-    """One direction: what was subtracted, and δ at the command, `... x n` [SI] each, what was learned there, and
-    whether it is not the exact one, `... x 1`: above 0."""
-
-    correction: Tensor
-    deviation: Tensor
-    learned: _Learned
-    doubt: Tensor
 
 
 class Compensator(nn.Module):
@@ -178,20 +151,19 @@ class Compensator(nn.Module):
 
     def deviation(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """δ at *commanded* joints, `... x n` [SI]: that of the way back; arguments and errors as `forward`."""
-        joints, covariates, strange = self._inputs(joints, covariates)
-        return self._back(joints, covariates, strange).deviation
+        return self._run(joints, covariates, 1)["back_deviation"]
 
     def learned(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Guarded and limited part that was learned, at *commanded* joints, `... x n` [SI]; as `forward`."""
-        return self._learned(*self._inputs(joints, covariates)).value
+        return self._learned(joints, covariates)[0].value
 
     def sd(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Standard deviation of a newly measured δ at *commanded* joints, model and noise, `... x n` [SI].
 
         Finite for every input; arguments and errors as `forward`.
         """
-        joints, covariates, strange = self._inputs(joints, covariates)
-        return self._sd(self._learned(joints, covariates, strange), strange)
+        learned, strange = self._learned(joints, covariates)
+        return torch.where(strange <= 0, self.sd_of(learned.weight, learned.features), self.fallback_sd)
 
     def sd_of(self, weight: Tensor, features: Tensor) -> Tensor:
         """`sd` where the guard's weight, `... x 1` [1], and the network's features, `... x i` [1], are known."""
@@ -209,22 +181,12 @@ class Compensator(nn.Module):
 
     def back(self, command: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Ideal joints of a command (or of the joints fed back), `... x n` [SI]; arguments and errors as `forward`."""
-        command, covariates, strange = self._inputs(command, covariates)
-        return command - self._back(command, covariates, strange).correction
+        return self._run(command, covariates, 1)["ideal"]
 
     def solve(self, joints: Tensor, covariates: Tensor | None = None) -> Solution:
         """Command of ideal joints, and the ideal joints were they a command; arguments and errors as `forward`."""
-        joints, covariates, strange = self._inputs(joints, covariates)
-        there, back = self._command(joints, covariates, strange), self._back(joints, covariates, strange)
-        return Solution(
-            joints - there.correction,
-            there.deviation,
-            there.learned.inside,
-            joints - back.correction,
-            back.learned.inside,
-            self._sd(there.learned, strange),
-            *(status_of(strange, way.learned.excess <= 0, way.doubt).squeeze(-1) for way in (there, back)),
-        )
+        found = self._run(joints, covariates, 0, 1)
+        return Solution(*(found[name] for name in Solution._fields))
 
     def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `solve`, for deviations and weights instead of joints, which single precision cannot hold.
@@ -233,19 +195,14 @@ class Compensator(nn.Module):
             δ at the command `... x n` [SI], its weight `... x 1` [1] (1 inside the domain); δ and weight were the
             joints given a command.
         """
-        joints, covariates, strange = self._inputs(joints, covariates)
-        there, back = self._command(joints, covariates, strange), self._back(joints, covariates, strange)
-        return there.deviation, there.learned.weight, back.deviation, back.learned.weight
+        found = self._run(joints, covariates, 0, 1)
+        return found["deviation"], found["guard"], found["back_deviation"], found["back_guard"]
 
     @property
     def export_tolerance(self) -> float:
         """Share of the limit to which exports agree: 1e-12, or what network, geometry or effects ask for."""
         parts = (self.network, self.geometry, self.effects, self.machine)
         return max(float(getattr(part, "export_tolerance", TOLERANCE)) for part in parts)
-
-    def next_correction(self, deviation: Tensor, correction: Tensor, steps: list[Step]) -> tuple[Tensor, list[Step]]:
-        """What to subtract from the ideal joints next; see `secant.next_correction`."""
-        return next_correction(deviation, correction, steps, self.most) if self.secant else (deviation, steps)
 
     def hook(self, warn: bool = True) -> Hook:
         """For `mechanism.inverse_kinematics.register_forward_hook(compensator.hook(), with_kwargs=True)`.
@@ -280,153 +237,46 @@ class Compensator(nn.Module):
 
         return compensate
 
-    def _inputs(self, joints: Tensor, covariates: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Finite joints and covariates, and how many inputs were not finite, `... x 1`."""
-        n, m = len(self.joints), len(self.covariates)
-        if joints.shape[-1] != n:
-            names = ", ".join(c.header for c in self.joints)
-            raise InputError(f"the compensator takes the {n} joints {names}; got {joints.shape[-1]}")
-        if m == 0:
-            finite = self.domain.clean(joints)
-            return finite.inputs, joints.new_zeros(*joints.shape[:-1], 0), finite.strange
-        names = ", ".join(c.header for c in self.covariates)
-        if covariates is None:
-            raise InputError(f"the compensator needs the covariates {names}; give covariates=… with {m} columns")
-        if covariates.shape[-1] != m:
-            raise InputError(f"the compensator needs the covariates {names}; got {covariates.shape[-1]} columns")
-        finite = self.domain.clean(torch.cat([joints, covariates.to(joints.dtype)], -1))
-        return finite.inputs[..., :n], finite.inputs[..., n:], finite.strange
-
-    def _command(self, joints: Tensor, covariates: Tensor, strange: Tensor) -> _Way:
-        """From finite ideal joints to the command."""
-        correction, steps = torch.zeros_like(joints), list[Step]()
-        aim = joints[..., :0] if self.machine is None else self.machine.aim(joints)
-        first, found, doubt = self.step(joints, covariates, strange, correction, aim)
-        last, start = first, found
-        for _ in range(self.iterations):
-            correction, steps = self.next_correction(found, correction, steps)
-            last, found, doubt = self.step(joints - correction, covariates, strange, correction, aim)
-        if self.machine is None:
-            known = strange <= 0
-            return _Way(torch.where(known, correction, 0.0), torch.where(known, found, 0.0), last, doubt)
-        good = self.is_allowed(correction) & (doubt <= ASTRAY)
-        learned = _Learned(*(torch.where(good, a, b) for a, b in zip(last, first, strict=True)))
-        given = torch.where(strange <= 0, torch.where(good, correction, start), 0.0)
-        return _Way(given, given, learned, doubt)
-
-    def step(
-        self, command: Tensor, covariates: Tensor, strange: Tensor, correction: Tensor, aim: Tensor
-    ) -> tuple[_Learned, Tensor, Tensor]:
-        """What was learned at a command, the correction to try next `... x n` [SI], and whether this one is not
-        the exact one, `... x 1`: above 0.
-
-        Args:
-            command, correction: tried, `... x n` [SI]; they add up to the ideal joints.
-            covariates, strange: as `_inputs` gives them.
-            aim: of the machine; nothing without one.
-        """
-        learned = self._learned(command, covariates, strange)
-        if self.machine is None:
-            return learned, self._deviation(command, covariates, learned), torch.zeros_like(learned.excess)
-        moved = command + learned.value
-        wanted = self.machine.next_correction(moved, self._held(covariates), command + correction, correction, aim)
-        return learned, *self._settled(command + correction, wanted, correction, aim)
-
-    def step_back(self, ideal: Tensor, correction: Tensor, aim: Tensor) -> tuple[Tensor, Tensor]:
-        """As `step` for the way back of a machine: command less ideal joints to try next, and doubt."""
-        assert self.machine is not None
-        wanted = self.machine.next_back(ideal, correction, aim)
-        return self._settled(None, wanted, correction, aim)
-
-    def aim_back(self, command: Tensor, covariates: Tensor, strange: Tensor) -> tuple[_Learned, Tensor]:
-        """What was learned at a command, and the machine's aim for the way back."""
-        assert self.machine is not None
-        learned = self._learned(command, covariates, strange)
-        return learned, self.machine.aim_back(command + learned.value, self._held(covariates))
-
-    def _settled(self, ideal: Tensor | None, wanted: Tensor, correction: Tensor, aim: Tensor) -> tuple[Tensor, Tensor]:
-        """The next correction within its bounds, and whether the one at hand is damped, at a bound or on its way."""
-        assert self.machine is not None
-        if ideal is None:
-            bounded = torch.minimum(torch.maximum(wanted, -self.most), self.most)
-        else:
-            bounded = self.machine.within(ideal, wanted, self.most)
-        ones = torch.ones_like(self.most).unsqueeze(-1)
-        away = torch.relu((wanted - correction).abs() - SETTLED) @ ones
-        return bounded, away + aim[..., -1:]
-
     def is_allowed(self, correction: Tensor) -> Tensor:
         """Whether a correction `... x n` [SI] is within the bound of the whole deviation, `... x 1`; NaN is not."""
         return (correction.abs() <= self.most * (1 + 1e-9)).all(-1, keepdim=True)
 
-    def _back(self, command: Tensor, covariates: Tensor, strange: Tensor) -> _Way:
-        """From a finite command to the ideal joints."""
-        if self.machine is None:
-            learned = self._learned(command, covariates, strange)
-            found, doubt = -self._deviation(command, covariates, learned), torch.zeros_like(strange)
-        else:
-            learned, aim = self.aim_back(command, covariates, strange)
-            start, doubt = self.step_back(command, torch.zeros_like(command), aim)
-            found = start
-            for _ in range(self.iterations):
-                correction = found
-                found, doubt = self.step_back(command - correction, correction, aim)
-            found = torch.where(self.is_allowed(correction) & (doubt <= ASTRAY), correction, start)
-        given = torch.where(strange <= 0, found, 0.0)
-        return _Way(given, -given, learned, doubt)
-
-    def _learned(self, joints: Tensor, covariates: Tensor, strange: Tensor) -> _Learned:
-        """What was learned, at commanded, finite joints."""
-        inputs = torch.cat([joints, covariates], -1) if self.covariates else joints
-        caged = self.domain.cage(inputs)
-        features = self.scaling.features(caged)
-        raw = self.scaling.restore(self.network(features))
-        excess = self.domain.excess(caged) + strange
-        fade = torch.relu(1 - excess)
-        weight = fade * fade
-        # Two products instead of safe + weight · (limited - safe): each end is then exact.
-        value = self._limited(weight * self._limited(raw) + (1 - weight) * self.safe)
-        return _Learned(value, weight, excess, features)
-
-    def _deviation(self, joints: Tensor, covariates: Tensor, learned: _Learned) -> Tensor:
-        """δ at commanded, finite joints, without a machine."""
-        value, n = learned.value, len(self.joints)
-        if self.effects is None and self.geometry is None:
-            return value
-        caged = self.domain.cage(torch.cat([joints, covariates], -1) if self.covariates else joints)
-        if self.effects is not None:
-            value = self._limited(value + learned.weight * self.effects(caged[..., :n] + value, caged[..., n:]))
-        if self.geometry is not None:
-            value = self._limited(value + learned.weight * self.geometry(caged[..., :n] + value))
-        return value
-
-    def _held(self, covariates: Tensor) -> Tensor:
+    def held(self, covariates: Tensor) -> Tensor:
         """Covariates held at the ends of what was measured."""
         n = len(self.joints)
         centre, half = self.domain.centre[n:], self.domain.half_range[n:]
         return torch.minimum(torch.maximum(covariates, centre - half), centre + half)
 
-    def _sd(self, learned: _Learned, strange: Tensor) -> Tensor:
-        """Of a newly measured δ, where this one was learned."""
-        return torch.where(strange <= 0, self.sd_of(learned.weight, learned.features), self.fallback_sd)
-
-    def _limited(self, deviation: Tensor) -> Tensor:
+    def limited(self, deviation: Tensor) -> Tensor:
+        """Within the limit."""
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
 
+    def _run(self, joints: Tensor, covariates: Tensor | None, *routines: int) -> Variables:
+        """Variables after the command (0) or the way back (1)."""
+        functions, every = Functions(self), routines_of(self, KEPT)
+        values = functions.start(self._inputs(joints, covariates))
+        return reduce(lambda found, k: functions.run(every[k].statements, found), routines, values)
 
-def status_of(strange: Tensor, inside: Tensor, doubt: Tensor | None = None) -> Tensor:
-    """Of a command, `... x 1`, int64.
+    def _learned(self, joints: Tensor, covariates: Tensor | None) -> tuple[Learned, Tensor]:
+        """What was learned at commanded joints, and how many inputs were not finite, `... x 1`."""
+        functions = Functions(self)
+        _, q, x, strange, known = functions.clean(self._inputs(joints, covariates)).values()
+        return functions.learned(q, x, strange, known), strange
 
-    Args:
-        strange: how many inputs were not finite, `... x 1`.
-        inside: whether it is inside the domain and is what the model promises, `... x 1`.
-        doubt: above 0 where it is not the exact one, `... x 1`.
-    """
-    found = torch.where(inside, EXACT, OUTSIDE)
-    if doubt is not None:
-        # Written so that what is no number is not exact.
-        found = torch.where(doubt <= 0, found, DAMPED)
-    return torch.where(strange > 0, NOT_FINITE, found)
+    def _inputs(self, joints: Tensor, covariates: Tensor | None) -> Tensor:
+        """Joints and covariates side by side, `... x (n + m)` [SI]."""
+        n, m = len(self.joints), len(self.covariates)
+        if joints.shape[-1] != n:
+            names = ", ".join(c.header for c in self.joints)
+            raise InputError(f"the compensator takes the {n} joints {names}; got {joints.shape[-1]}")
+        if m == 0:
+            return joints
+        names = ", ".join(c.header for c in self.covariates)
+        if covariates is None:
+            raise InputError(f"the compensator needs the covariates {names}; give covariates=… with {m} columns")
+        if covariates.shape[-1] != m:
+            raise InputError(f"the compensator needs the covariates {names}; got {covariates.shape[-1]} columns")
+        return torch.cat([joints, covariates.to(joints.dtype)], -1)
 
 
 def default_limit(deviations: Tensor) -> Tensor:

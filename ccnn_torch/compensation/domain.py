@@ -18,6 +18,8 @@ _THINNEST = 0.05
 _SLOPE = 0.1
 # Largest slope of (1 - e²)² over e, at e = 1/√3.
 _STEEPEST = 8 / (3 * math.sqrt(3))
+# Points of `spread_points`: training inputs, and six times as many between and around them.
+POINTS = 2048
 # Beyond this many transitions the guard has long reached its end; inputs are clamped there to stay finite.
 _CAGE = 1.01
 
@@ -174,3 +176,17 @@ class Domain(nn.Module):
                 "transition": self.width[len(self.centre) :].tolist(),
             },
         }
+
+
+def spread_points(inputs: Tensor, domain: Domain, generator: torch.Generator, count: int = POINTS) -> Tensor:
+    """The training inputs, points between them, and points all through the transition around them, `s x d` [SI]."""
+    rows = inputs[torch.randperm(len(inputs), generator=generator)[:count]]
+    pick = torch.randint(len(inputs), (2, 2 * count), generator=generator)
+    share = torch.rand(3, 2 * count, 1, generator=generator, dtype=inputs.dtype)
+    between = inputs[pick[0]] + share[0] * (inputs[pick[1]] - inputs[pick[0]])
+    d = len(domain.centre)
+    widest = float((1 + domain.width[:d] / domain.radius[:d]).max()) * 1.1
+    outward = domain.centre + (between - domain.centre) * (1 + share[1] * (widest - 1))
+    noise = torch.randn(outward.shape, generator=generator, dtype=inputs.dtype)
+    around = inputs[pick[1]] + noise * share[2] * domain.half_range * domain.width[:d]
+    return domain.cage(torch.cat([rows, between, outward, around]))

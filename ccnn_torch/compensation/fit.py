@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.compensation.compensator import Compensator, default_limit
-from ccnn_torch.compensation.contraction import (
-    STEEPEST_DEVIATION,
-    Steepness,
-    iterations_needed,
-    spread_points,
-    steepest,
-)
-from ccnn_torch.compensation.domain import Domain
-from ccnn_torch.compensation.effects.effects import PhysicalEffects
-from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
-from ccnn_torch.compensation.machine.machine import ASTRAY, FARTHEST, Machine
-from ccnn_torch.compensation.secant import Step, secant_steps
+from ccnn_torch.compensation.compensator import TOLERANCE, Compensator, default_limit
+from ccnn_torch.compensation.domain import POINTS, Domain, spread_points
+from ccnn_torch.compensation.effects import PhysicalEffects
+from ccnn_torch.compensation.expansions import ChebyshevExpansion
+from ccnn_torch.compensation.machine import ASTRAY, FARTHEST, Machine
+from ccnn_torch.compensation.routines import Functions, Variables, next_step, routines_of
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.training import Scaling
 
+# A unique command exists below a slope of 1. At this one the fixed point takes 40 steps, and
+# a slope that sampling missed still has room.
+STEEPEST_DEVIATION = 0.5
+
+# Points that are compared, how many a pass takes, how many climb on, and for how many rounds.
+_AT_ONCE, _CLIMBERS, _ROUNDS = 256, 64, 12
+# The steepest of the points tried is not the steepest of all.
+_SAFETY = 1.25
 # Rounds of damping, and the share of what was learned below which a compensator is not worth having.
 _DAMPINGS = 6
 _LEAST_SHARE = 0.1
@@ -38,6 +40,86 @@ _COUNTED = 512
 _MOST_STEPS, _DOUBLINGS, _FAR, _FEW = 12, 3, 0.5, 1e-3
 # Of the largest deviation in and around the domain: what the whole deviation may be.
 _ROOM = 1.5
+
+
+# Share of the limit to which single precision is right.
+SINGLE_TOLERANCE = 1e-5
+
+
+class Steepness(NamedTuple):
+    """`lipschitz`: bound of the slope in units of the limits; `largest`: max|δ| in the same, at most 1."""
+
+    lipschitz: float
+    largest: float
+
+
+def steepest(
+    deviation: Callable[[Tensor, Tensor | None], Tensor],
+    inputs: Tensor,
+    domain: Domain,
+    limit: Tensor,
+    count: int = POINTS,
+    at_once: int = _AT_ONCE,
+) -> Steepness:
+    """Find the steepest slope of δ over the domain and the transition around it, by sampling and hill climbing.
+
+    Joints are measured in units of their limits, so that metres and radians, and joints of large and small deviations,
+    count alike; the norm is the maximum row sum, which bounds the error of every joint.
+
+    Args:
+        deviation: (joints `s x n`, covariates `s x m` or None) -> δ `s x n` [SI].
+        inputs: training inputs, `s x (n + m)` [SI].
+        domain: fitted to them.
+        limit: `n` [SI].
+        count: inputs that are compared; of points between and around them there are six times as many.
+        at_once: points that one pass takes; a geometry's many small operations take hardly longer for more of them.
+    """
+    n = len(limit)
+    positive = limit[limit > 0]
+    scale = torch.where(limit > 0, limit, positive.min() if len(positive) else torch.ones_like(limit))
+
+    def slope(points: Tensor) -> tuple[Tensor, Tensor]:
+        # In pieces: a network that compares each point with thousands of rows keeps a matrix for every operation.
+        slopes, sizes = zip(*(slope_of_few(part) for part in torch.split(points, at_once)), strict=True)
+        return torch.cat(slopes), torch.cat(sizes)
+
+    def slope_of_few(points: Tensor) -> tuple[Tensor, Tensor]:
+        joints = points[:, :n].clone().requires_grad_()
+        value = deviation(joints, points[:, n:])
+        # One row of the Jacobian of every point at once, since the points do not know of each other.
+        rows = [torch.autograd.grad(value[:, i].sum(), joints, retain_graph=True)[0] for i in range(n)]
+        jacobian = torch.stack(rows, 1) * scale / scale.unsqueeze(-1)
+        return jacobian.abs().sum(-1).amax(-1), (value.detach().abs() / scale).amax(-1)
+
+    generator = torch.Generator().manual_seed(0)
+    points = spread_points(inputs, domain, generator, count)
+    slopes, sizes = slope(points)
+    chosen = slopes.topk(min(_CLIMBERS, len(points))).indices
+    points, best = points[chosen], slopes[chosen]
+    step = domain.half_range * 0.2
+    for _ in range(_ROUNDS):
+        draw = torch.randn(points.shape, generator=generator, dtype=points.dtype)
+        candidates = domain.cage(points + step * draw)
+        found, _ = slope(candidates)
+        better = found > best
+        points = torch.where(better.unsqueeze(-1), candidates, points)
+        best = torch.maximum(best, found)
+        step = step * 0.7
+    return Steepness(_SAFETY * float(best.max()), min(1.0, float(sizes.max())))
+
+
+def iterations_needed(found: Steepness, tolerance: float = TOLERANCE) -> int:
+    """Smallest k, at least 1, with lipschitzᵏ · max|δ| ≤ tolerance, both in units of the limit."""
+    if found.lipschitz == 0 or found.largest <= tolerance:
+        return 1
+    exact = math.log(tolerance / found.largest) / math.log(found.lipschitz)
+    # A slope of exactly 1e-4 takes 3 steps, also where the quotient of the logarithms comes out as 3 + 4e-16.
+    return max(1, math.ceil(exact - 1e-9))
+
+
+def single_steps(compensator: Compensator) -> int:
+    """Steps of the fixed point after which single precision shows no more."""
+    return iterations_needed(Steepness(compensator.lipschitz, 1.0), SINGLE_TOLERANCE / 10)
 
 
 def fit_compensator(
@@ -139,18 +221,27 @@ def fit_compensator(
     )
 
 
+@torch.no_grad()
 def _accelerate(compensator: Compensator, inputs: Tensor) -> None:
-    """Let Broyden's method find the command where that takes fewer steps; inputs: training inputs, `s x (n + m)`."""
-    if compensator.iterations <= _GENTLE_STEPS:
+    """Let Broyden's method find the command where that takes fewer steps; inputs: training inputs, `s x (n + m)`.
+
+    Steps are counted until d = δ(q - d) holds at points in and around the domain, to what exports are right to and the
+    rounding of a command.
+    """
+    most = compensator.iterations
+    if most <= _GENTLE_STEPS:
         return
+    compensator.secant = True
     points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED)
-    n = len(compensator.joints)
-    steps = secant_steps(
-        lambda joints: compensator.deviation(joints, points[:, n:] if compensator.covariates else None),
-        points[:, :n], compensator.limit, compensator.iterations, compensator.export_tolerance,
-    )  # fmt: skip
-    compensator.secant = steps < compensator.iterations
-    compensator.iterations = steps
+    functions, values = _begun(compensator, points, most)
+    rounding = torch.finfo(points.dtype).eps * values["q"].abs()
+    allowed = compensator.export_tolerance * compensator.limit + rounding
+    for count in range(1, most):
+        functions.run(next_step(compensator), values)
+        if bool(((values["found"] - values["correction"]).abs() <= allowed).all()):
+            compensator.iterations = count
+            return
+    compensator.secant = False
 
 
 @torch.no_grad()
@@ -165,13 +256,12 @@ def settle(compensator: Compensator, inputs: Tensor) -> None:
     machine, n = compensator.machine, len(compensator.joints)
     assert machine is not None
     points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED // 2)
-    joints, covariates, strange = compensator._inputs(points[:, :n], points[:, n:])
     compensator.most.fill_(_FAR)
     compensator.domain.huge[:n] = FARTHEST
     rule, best = machine.rule, math.inf
     for doubling in range(_DOUBLINGS + 1):
         machine.rule = rule.farther(2.0**doubling)
-        shares, correction, doubt = _settling(compensator, joints, covariates, strange)
+        shares, correction, doubt = _settling(compensator, points)
         # Damped, or on its way for ever: the fewer the better.
         inexact = float((doubt > 0).double().mean())
         if inexact >= best:
@@ -189,7 +279,7 @@ def settle(compensator: Compensator, inputs: Tensor) -> None:
     if compensator.iterations > _GENTLE_STEPS // 2:
         # What was learned is no part of the Jacobian: Broyden's method finds what it does.
         compensator.secant = True
-        faster = _settling(compensator, joints, covariates, strange)[0]
+        faster = _settling(compensator, points)[0]
         compensator.secant = faster[-1] <= shares[-1] + _FEW and _enough(faster) < compensator.iterations
         compensator.iterations = _enough(faster) if compensator.secant else compensator.iterations
 
@@ -199,19 +289,19 @@ def _enough(shares: list[float]) -> int:
     return next(k for k, share in enumerate(shares, 1) if share <= shares[-1] + _FEW)
 
 
-def _settling(
-    compensator: Compensator, joints: Tensor, covariates: Tensor, strange: Tensor
-) -> tuple[list[float], Tensor, Tensor]:
+def _settling(compensator: Compensator, inputs: Tensor) -> tuple[list[float], Tensor, Tensor]:
     """Share of the regular rows that have not settled after each step, and the last correction with its doubt."""
-    assert compensator.machine is not None
-    aim = compensator.machine.aim(joints)
-    regular = aim[:, -1] <= 0
-    correction, shares, steps = torch.zeros_like(joints), list[float](), list[Step]()
-    _, following, doubt = compensator.step(joints, covariates, strange, correction, aim)
+    (functions, values), shares = _begun(compensator, inputs, _MOST_STEPS), list[float]()
+    regular = values["aim"][:, -1] <= 0
     for _ in range(_MOST_STEPS):
-        correction, steps = compensator.next_correction(following, correction, steps)
-        _, following, doubt = compensator.step(joints - correction, covariates, strange, correction, aim)
-        shares.append(float((doubt[regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
+        functions.run(next_step(compensator), values)
+        shares.append(float((values["doubt"][regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
         if shares[-1] == 0:
             break
-    return shares, correction, doubt
+    return shares, values["correction"], values["doubt"]
+
+
+def _begun(compensator: Compensator, inputs: Tensor, most: int) -> tuple[Functions, Variables]:
+    """Functions with room for so many steps, and variables of inputs `s x (n + m)` [SI] after the first evaluation."""
+    functions, start = Functions(compensator, most), routines_of(compensator)[0].statements
+    return functions, functions.run(start[: start.index("step") + 1], functions.start(inputs))

@@ -1,23 +1,35 @@
-"""The command and the way back as routines: functions of torch on named variables, and the statements that call them.
+"""The command and the way back: the formulas of a compensator on named variables, and the statements that call them.
 
-Every export is made of these: C99 and Structured Text function by function with the statements around them, ONNX as
-one graph without loops.
+Everything that commands is made of these: the eager model runs them, ONNX has them as one graph without loops, C99 and
+Structured Text function by function with the statements around them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from inspect import signature
-from typing import Any, ClassVar, NamedTuple
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation.compensator import Compensator, status_of
-from ccnn_torch.compensation.machine.machine import ASTRAY
-from ccnn_torch.compensation.secant import Step
+from ccnn_torch.compensation.machine import ASTRAY, SETTLED
+
+if TYPE_CHECKING:
+    from ccnn_torch.compensation.compensator import Compensator
+
+EXACT, OUTSIDE, NOT_FINITE, DAMPED = range(4)
+"""Status of a command: exact; outside what was measured; an input is not finite, and the command is the joints; damped
+near a singular pose, at a limit or not settled, and the command is the nearest safe one."""
+
+# Steps of Broyden's method below it are rounding, from which nothing is learned: share of the limit.
+_ROUNDING = 1e-10
+# A slope of at most 1/2, as compensators have, keeps the denominator above this but for curvature.
+_LEAST = 0.5
 
 
 class Copy(NamedTuple):
@@ -59,15 +71,55 @@ class Routine:
     @property
     def calls(self) -> list[tuple[str, int]]:
         """Functions, and how often each is called."""
-        return [*_calls(self.statements, 1)]
+        return [(one, times) for one, times in _flat(self.statements, 1) if isinstance(one, str)]
+
+    @property
+    def read(self) -> set[str]:
+        """Variables that are copied or given."""
+        copied = {one.source for one, _ in _flat(self.statements, 1) if isinstance(one, Copy)}
+        return {*self.returns, "status", *copied}
 
 
-def _calls(statements: Sequence[Statement], times: int) -> Iterator[tuple[str, int]]:
+def _flat(statements: Sequence[Statement], times: int) -> Iterator[tuple[Statement, int]]:
+    for statement in statements:
+        if isinstance(statement, Repeat):
+            yield from _flat(statement.statements, times * statement.times)
+        else:
+            yield statement, times
+
+
+def execute(
+    statements: Sequence[Statement],
+    values: dict[str, Any],
+    call: Callable[[str, dict[str, Any]], dict[str, Any]],
+    zeros: Callable[[str], Any],
+) -> dict[str, Any]:
+    """Variables after statements; `values` has them before, and is changed.
+
+    Args:
+        call: (name of a function, variables) -> the variables that it gives.
+        zeros: name of a variable -> its zeros.
+    """
     for statement in statements:
         if isinstance(statement, str):
-            yield statement, times
-        elif isinstance(statement, Repeat):
-            yield from _calls(statement.statements, times * statement.times)
+            values |= call(statement, values)
+        elif isinstance(statement, Copy):
+            values[statement.target] = values[statement.source] if statement.source else zeros(statement.target)
+        else:
+            for _ in range(statement.times):
+                execute(statement.statements, values, call, zeros)
+    return values
+
+
+# What a machine falls back to where its last step went astray.
+KEPT = (Copy("near_weight", "weight"), Copy("near_features", "features"))
+
+
+def next_step(own: Compensator) -> tuple[Statement, ...]:
+    """What takes the correction that a step found, and tries it."""
+    if own.secant:
+        return "following", Copy("correction", "next"), Copy("steps", "done"), "step"
+    return Copy("correction", "found"), "step"
 
 
 def routines_of(own: Compensator, kept: Sequence[Copy] = ()) -> list[Routine]:
@@ -76,11 +128,8 @@ def routines_of(own: Compensator, kept: Sequence[Copy] = ()) -> list[Routine]:
     Args:
         kept: what the end of a machine's command needs of its first step, beside `first` and `near`.
     """
-    following: tuple[Statement, ...] = (Copy("correction", "found"),)
     start: tuple[Statement, ...] = ("clean", Copy("correction"))
-    if own.secant:
-        following, start = ("following", Copy("correction", "next"), Copy("steps", "done")), (*start, Copy("steps"))
-    again = Repeat(own.iterations, (*following, "step"))
+    again = Repeat(own.iterations, next_step(own))
     command: tuple[Statement, ...] = ("step", again, "finish")
     back: tuple[Statement, ...] = ("step", "finish_back")
     if own.machine is not None:
@@ -90,55 +139,274 @@ def routines_of(own: Compensator, kept: Sequence[Copy] = ()) -> list[Routine]:
         back = "aim_back", "back", Copy("first", "found"), again, "choose_back"
     about = "Command for ideal joints: command + deviation = joints."
     about_back = "The way back: ideal joints of a command, or of joints fed back."
+    blank = (Copy("steps"),) if own.secant else ()
     return [
-        Routine("compensate", about, "joints", ("command", "deviation"), (*start, *command)),
-        Routine("ideal", about_back, "command", ("joints",), (*start[:2], *back)),
+        Routine("compensate", about, "joints", ("command", "deviation"), (*start, *blank, *command)),
+        Routine("ideal", about_back, "command", ("joints",), (*start, *back)),
     ]
 
 
+class Step(NamedTuple):
+    """A step in units of the limits, and what gives another vector's share of it, `... x n` each."""
+
+    whole: Tensor
+    dual: Tensor
+
+
+def next_correction(
+    deviation: Tensor, correction: Tensor, steps: list[Step], limit: Tensor
+) -> tuple[Tensor, list[Step]]:
+    """One step of Broyden's "good" method for d = δ(q - d), in sums, products, quotients and a maximum.
+
+    The fixed point d ← δ(q - d) gains one factor of δ's slope with each evaluation of δ. This method learns that slope
+    from the steps that were done, so that each gains more than the one before. It starts from the fixed point and needs
+    no derivative; no matrix is kept, only the steps (C. T. Kelley, "Iterative methods for linear and nonlinear
+    equations", SIAM 1995, section 7.3).
+
+    Args:
+        deviation: δ(q - correction), `... x n` [SI].
+        correction: d, `... x n` [SI]; 0 at first.
+        steps: those before, in order; blank ones (zeros) change nothing.
+        limit: of |δ|, `n` [SI].
+
+    Returns:
+        The next d, and the steps with this one.
+    """
+    ones = torch.ones_like(limit)
+    unit, ones = torch.where(limit > 0, limit, ones), ones.unsqueeze(-1)
+    whole = (deviation - correction) / unit
+    if steps:
+        for before, after in pairwise(steps):
+            # Steps shrink, so that the share is below 1 but for rounding, which must not grow.
+            whole = whole + after.whole * torch.clamp((before.dual * whole) @ ones, -1.0, 1.0)
+        whole = whole / torch.clamp_min(1 - (steps[-1].dual * whole) @ ones, _LEAST)
+    # A sum as a product: engines with a narrow operator list have no other reduction.
+    dual = whole / ((whole * whole) @ ones + _ROUNDING**2)
+    return correction + unit * whole, [*steps, Step(whole, dual)]
+
+
+def status_of(strange: Tensor, inside: Tensor, doubt: Tensor | None = None) -> Tensor:
+    """Of a command, `... x 1`, int64.
+
+    Args:
+        strange: how many inputs were not finite, `... x 1`.
+        inside: whether it is inside the domain and is what the model promises, `... x 1`.
+        doubt: above 0 where it is not the exact one, `... x 1`.
+    """
+    found = torch.where(inside, EXACT, OUTSIDE)
+    if doubt is not None:
+        # Written so that what is no number is not exact.
+        found = torch.where(doubt <= 0, found, DAMPED)
+    return torch.where(strange > 0, NOT_FINITE, found)
+
+
+class Learned(NamedTuple):
+    """δ as it was learned, `... x n` [SI]; the guard's excess and weight, `... x 1` [1] each; the network's features,
+    `... x i` [1]; and the inputs as the network takes them, `... x (n + m)` [SI]."""
+
+    value: Tensor
+    excess: Tensor
+    weight: Tensor
+    features: Tensor
+    caged: Tensor
+
+
+Variables = dict[str, Tensor]
+
+
 class Functions:
-    """Functions of a compensator, with the variables that they take as parameters.
+    """The formulas of a compensator.
 
-    Variables: `given`, `covariates` as they are given; `q`, `x` the same made finite, and `strange`, how many were not;
-    `aim` of a machine; `correction` tried, `found` to try next, `excess` above 0 outside the domain, and `doubt` above
-    0 where `correction` is not the exact one; `first`, `near`: `found` and `excess` of the first step; `steps` of
+    Every function takes variables as parameters of their names and gives others. Variables: `inputs` as given; `ideal`
+    and `x` joints and covariates made finite, `q` those joints as they are looked at; `strange`, how many inputs were
+    not finite, and `known`, 1 where all were, else 0; `aim` of a machine; `correction` tried, `found` to try next,
+    `doubt` above 0 where `correction` is not the exact one; the guard's `excess`, above 0 outside the domain, its
+    `weight` and the network's `features`; `first` and `near…`, `found` and the others of the first step; `steps` of
     Broyden's method, with `next` and `done` to follow.
-
-    Attributes:
-        outputs: variables that each function gives.
-        examples: of every variable, `rows x …`.
     """
 
-    outputs: ClassVar[dict[str, str]] = {"aim": "aim", "following": "next done", "back": "found doubt"}
-
-    def __init__(self, own: Compensator, rows: int = 1) -> None:
+    def __init__(self, own: Compensator, room: int = 0) -> None:
+        """room: for so many of Broyden's steps; as many as the command takes when 0."""
         self.own, self.joints = own, len(own.joints)
-        point = own.domain.centre.repeat(rows, 1)
-        q, x = point[:, : self.joints].contiguous(), point[:, self.joints :].contiguous()
-        self.examples = {"inputs": point, "given": q, "covariates": x, "q": q, "x": x}
-        self.examples |= dict.fromkeys(("strange", "near", "excess", "doubt"), torch.zeros_like(point[:, :1]))
-        self.examples |= dict.fromkeys(("first", "correction", "found"), torch.zeros_like(q))
-        self.examples["aim"] = q[:, :0] if own.machine is None else own.machine.aim(q)
-        self.room = max(1, own.iterations - 1)
+        self.room = room or max(1, own.iterations - 1)
+        # Without what is computed at the caged joints themselves, joints may be caged once, with room for a correction:
+        # beyond the cage all deviations are the safe one.
+        self.caged_once = own.geometry is None and own.effects is None and own.machine is None
 
     def inputs_of(self, name: str) -> list[str]:
         """Variables that a function takes."""
-        return [*signature(getattr(self, name)).parameters]
+        return _parameters(getattr(type(self), name))
 
-    def aim(self, q: Tensor) -> Sequence[Tensor]:
-        assert self.own.machine is not None
-        return (self.own.machine.aim(q),)
+    def call(self, name: str, values: Variables) -> Variables:
+        """What a function gives."""
+        found: Variables = getattr(self, name)(*(values[key] for key in self.inputs_of(name)))
+        return found
 
-    def following(self, found: Tensor, correction: Tensor, steps: Tensor) -> Sequence[Tensor]:
+    def start(self, inputs: Tensor) -> Variables:
+        """Variables before a routine, for inputs `... x (n + m)` [SI], anything."""
+        given, covariates = inputs[..., : self.joints], inputs[..., self.joints :]
+        return {"inputs": inputs, "given": given, "covariates": covariates, "aim": inputs[..., :0]}
+
+    def run(self, statements: Sequence[Statement], values: Variables) -> Variables:
+        """Variables after statements; `values` has them before, and is changed."""
+        blank = torch.zeros_like(values["given"])
+        return execute(statements, values, self.call, lambda name: self.no_steps(blank) if name == "steps" else blank)
+
+    def no_steps(self, blank: Tensor) -> Tensor:
+        """`steps` before the first one; blank: joints, `... x n`."""
+        return blank[..., :0]
+
+    def clean(self, inputs: Tensor) -> Variables:
+        n, own, domain = self.joints, self.own, self.own.domain
+        finite, strange = domain.clean(inputs)
+        at = finite
+        if self.caged_once:
+            room = torch.cat([own.limit, own.limit.new_zeros(len(own.covariates))])
+            at = torch.minimum(torch.maximum(finite, domain._cage_low - room), domain._cage_high + room)
+        known = 1 - torch.clamp(strange, 0.0, 1.0)
+        return {"ideal": finite[..., :n], "q": at[..., :n], "x": at[..., n:], "strange": strange, "known": known}
+
+    def excess(self, caged: Tensor) -> Tensor:
+        """How far beyond the margin, `... x 1` [1]."""
+        return self.own.domain.excess(caged)
+
+    def faded(self, raw: Tensor, weight: Tensor, known: Tensor) -> Tensor:
+        """What a network gives `... x n` [SI], limited, and faded into the safe correction by its weight `... x 1`."""
+        own = self.own
+        # Two products instead of safe + weight · (limited - safe): each end is then exact.
+        return own.limited(weight * own.limited(raw) + (known - weight) * own.safe)
+
+    def learned(self, command: Tensor, x: Tensor, strange: Tensor, known: Tensor) -> Learned:
+        """What was learned at a command."""
+        own = self.own
+        inputs = torch.cat([command, x], -1)
+        caged = inputs if self.caged_once else own.domain.cage(inputs)
+        features = own.scaling.features(caged)
+        raw = own.scaling.restore(own.network(features))
+        excess = self.excess(caged) + strange
+        fade = torch.relu(1 - excess)
+        weight = fade * fade
+        value = self.faded(raw, weight, known)
+        return Learned(value, excess, weight, features, caged)
+
+    def step(self, q: Tensor, x: Tensor, strange: Tensor, known: Tensor, correction: Tensor, aim: Tensor) -> Variables:
+        own, n = self.own, self.joints
+        learned = self.learned(q - correction, x, strange, known)
+        found, excess, weight, features, caged = learned
+        doubt = torch.zeros_like(strange)
+        if own.machine is not None:
+            wanted = own.machine.next_correction(q - correction + found, own.held(x), q, correction, aim)
+            bounded = own.machine.within(q, wanted, own.most)
+            found, doubt = bounded, self._doubt(wanted, correction, aim)
+        if own.effects is not None:
+            found = own.limited(found + weight * own.effects(caged[..., :n] + found, caged[..., n:]))
+        if own.geometry is not None:
+            found = own.limited(found + weight * own.geometry(caged[..., :n] + found))
+        return {"found": found, "excess": excess, "weight": weight, "features": features, "doubt": doubt}
+
+    def following(self, found: Tensor, correction: Tensor, steps: Tensor) -> Variables:
         """The next correction, and the last steps with this one, of which there is room for so many."""
         n = self.joints
         parts = [steps[..., k : k + n] for k in range(0, steps.shape[-1], n)]
         before = [Step(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)]
-        following, after = self.own.next_correction(found, correction, before)
-        return following, torch.cat([number for step in after[-self.room :] for number in step], -1)
+        following, after = next_correction(found, correction, before, self.own.most)
+        return {"next": following, "done": torch.cat([part for step in after[-self.room :] for part in step], -1)}
 
-    def back(self, q: Tensor, correction: Tensor, aim: Tensor) -> Sequence[Tensor]:
-        return self.own.step_back(q - correction, correction, aim)
+    def aim(self, q: Tensor) -> Variables:
+        assert self.own.machine is not None
+        return {"aim": self.own.machine.aim(q)}
+
+    def aim_back(self, q: Tensor, x: Tensor, strange: Tensor, known: Tensor) -> Variables:
+        own = self.own
+        assert own.machine is not None
+        learned = self.learned(q, x, strange, known)
+        aim = own.machine.aim_back(q + learned.value, own.held(x))
+        return {"aim": aim, "excess": learned.excess, "weight": learned.weight}
+
+    def back(self, q: Tensor, correction: Tensor, aim: Tensor) -> Variables:
+        own = self.own
+        assert own.machine is not None
+        wanted = own.machine.next_back(q - correction, correction, aim)
+        bounded = torch.minimum(torch.maximum(wanted, -own.most), own.most)
+        return {"found": bounded, "doubt": self._doubt(wanted, correction, aim)}
+
+    def finish(
+        self,
+        ideal: Tensor,
+        strange: Tensor,
+        correction: Tensor,
+        found: Tensor,
+        excess: Tensor,
+        weight: Tensor,
+        features: Tensor,
+        doubt: Tensor,
+    ) -> Variables:
+        inside = excess <= 0
+        return {
+            "command": ideal - correction,
+            "deviation": found,
+            "inside_domain": inside.squeeze(-1),
+            "guard": weight,
+            "status": status_of(strange, inside, doubt).squeeze(-1),
+            "deviation_sd": torch.where(strange <= 0, self.own.sd_of(weight, features), self.own.fallback_sd),
+        }
+
+    def choose(
+        self,
+        ideal: Tensor,
+        strange: Tensor,
+        known: Tensor,
+        first: Tensor,
+        near: Tensor,
+        near_weight: Tensor,
+        near_features: Tensor,
+        correction: Tensor,
+        excess: Tensor,
+        weight: Tensor,
+        features: Tensor,
+        doubt: Tensor,
+    ) -> Variables:
+        good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
+        both = zip((correction, excess, weight, features), (first, near, near_weight, near_features), strict=True)
+        taken, excess, weight, features = (torch.where(good, *pair) for pair in both)
+        return self.finish(ideal, strange, known * taken, known * taken, excess, weight, features, doubt)
+
+    def finish_back(
+        self, ideal: Tensor, strange: Tensor, found: Tensor, excess: Tensor, weight: Tensor, doubt: Tensor
+    ) -> Variables:
+        inside = excess <= 0
+        return {
+            "ideal": ideal + found,
+            "back_deviation": found,
+            "ideal_inside_domain": inside.squeeze(-1),
+            "back_guard": weight,
+            "ideal_status": status_of(strange, inside, doubt).squeeze(-1),
+        }
+
+    def choose_back(
+        self,
+        ideal: Tensor,
+        strange: Tensor,
+        known: Tensor,
+        first: Tensor,
+        correction: Tensor,
+        excess: Tensor,
+        weight: Tensor,
+        doubt: Tensor,
+    ) -> Variables:
+        good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
+        deviation = -known * torch.where(good, correction, first)
+        return self.finish_back(ideal, strange, deviation, excess, weight, doubt)
+
+    def _doubt(self, wanted: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
+        """Whether a correction is damped, at a bound or on its way, `... x 1`: above 0."""
+        ones = torch.ones_like(self.own.most).unsqueeze(-1)
+        return torch.relu((wanted - correction).abs() - SETTLED) @ ones + aim[..., -1:]
+
+
+@cache
+def _parameters(function: Callable[..., Variables]) -> list[str]:
+    return [*signature(function).parameters][1:]
 
 
 class ControllerFunctions(Functions):
@@ -148,57 +416,54 @@ class ControllerFunctions(Functions):
     above its limit.
     """
 
-    outputs: ClassVar[dict[str, str]] = Functions.outputs | {
-        "clean": "q x strange",
-        "step": "found excess doubt",
-        "aim_back": "aim excess",
-        "finish": "command deviation status",
-        "choose": "command deviation status",
-        "finish_back": "joints status",
-        "choose_back": "joints status",
-        "spread": "sd status",
-    }
-
     def __init__(self, own: Compensator, slack: float, dtype: str) -> None:
         """slack: how far command + deviation may be from the joints, as a share of the limit [1]."""
         super().__init__(own)
+        self.caged_once = False
         self.slack = slack * torch.clamp_max(own.most, 1.0)
         # The rounding of a joint.
         self.eps = 8 * float(np.finfo(dtype).eps)
-        self.examples["steps"] = torch.zeros(1, 2 * self.joints * self.room, dtype=torch.float64)
 
-    def clean(self, given: Tensor, covariates: Tensor) -> Sequence[Tensor]:
-        return self.own._inputs(given, covariates)
+    def no_steps(self, blank: Tensor) -> Tensor:
+        return blank.repeat(1, 2 * self.room)
 
-    def step(self, q: Tensor, correction: Tensor, aim: Tensor, x: Tensor) -> Sequence[Tensor]:
+    def clean(self, given: Tensor, covariates: Tensor) -> Variables:  # type: ignore[override]
+        return super().clean(torch.cat([given, covariates], -1))
+
+    def step(self, q: Tensor, correction: Tensor, aim: Tensor, x: Tensor) -> Variables:  # type: ignore[override]
         blank = torch.zeros_like(q[..., :1])
-        learned, found, doubt = self.own.step(q - correction, x, blank, correction, aim)
-        return found, learned.excess, doubt
+        return super().step(q, x, blank, blank + 1, correction, aim)
 
-    def aim_back(self, q: Tensor, x: Tensor) -> Sequence[Tensor]:
-        learned, aim = self.own.aim_back(q, x, torch.zeros_like(q[..., :1]))
-        return aim, learned.excess
+    def aim_back(self, q: Tensor, x: Tensor) -> Variables:  # type: ignore[override]
+        blank = torch.zeros_like(q[..., :1])
+        return super().aim_back(q, x, blank, blank + 1)
 
-    def spread(self, q: Tensor, x: Tensor, strange: Tensor) -> Sequence[Tensor]:
-        learned = self.own._learned(q, x, torch.zeros_like(strange))
+    def spread(self, q: Tensor, x: Tensor, strange: Tensor) -> Variables:
+        blank = torch.zeros_like(strange)
+        learned = self.learned(q, x, blank, blank + 1)
         sd = self.own.sd_of(learned.weight, learned.features)
         good = torch.logical_and(sd >= 0, sd < torch.inf).all(-1, keepdim=True) & (strange <= 0)
-        return torch.where(good, sd, self.own.fallback_sd), status_of(strange, good & (learned.excess <= 0))
+        state = status_of(strange, good & (learned.excess <= 0))
+        return {"sd": torch.where(good, sd, self.own.fallback_sd), "status": state}
 
-    def finish(self, q: Tensor, strange: Tensor, correction: Tensor, found: Tensor, excess: Tensor) -> Sequence[Tensor]:
+    def finish(  # type: ignore[override]
+        self, q: Tensor, strange: Tensor, correction: Tensor, found: Tensor, excess: Tensor
+    ) -> Variables:
         command = q - correction
         rounding = self.slack + self.eps * (q.abs() + found.abs())
         # Written so that what is no number is not good.
         right = ((command + found - q).abs() <= rounding).all(-1, keepdim=True)
         good = right & self.own.is_allowed(found) & (strange <= 0)
         state = status_of(strange, good & (excess <= 0))
-        return torch.where(good, command, q), torch.where(good, found, 0.0), state
+        return {"command": torch.where(good, command, q), "deviation": torch.where(good, found, 0.0), "status": state}
 
-    def finish_back(self, q: Tensor, strange: Tensor, found: Tensor, excess: Tensor) -> Sequence[Tensor]:
+    def finish_back(  # type: ignore[override]
+        self, q: Tensor, strange: Tensor, found: Tensor, excess: Tensor
+    ) -> Variables:
         good = self.own.is_allowed(found) & (strange <= 0)
-        return torch.where(good, q + found, q), status_of(strange, good & (excess <= 0))
+        return {"joints": torch.where(good, q + found, q), "status": status_of(strange, good & (excess <= 0))}
 
-    def choose(
+    def choose(  # type: ignore[override]
         self,
         q: Tensor,
         strange: Tensor,
@@ -207,13 +472,14 @@ class ControllerFunctions(Functions):
         correction: Tensor,
         excess: Tensor,
         doubt: Tensor,
-    ) -> Sequence[Tensor]:
+    ) -> Variables:
         good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
         deviation = torch.where(strange <= 0, torch.where(good, correction, first), 0.0)
-        return q - deviation, deviation, status_of(strange, torch.where(good, excess, near) <= 0, doubt)
+        state = status_of(strange, torch.where(good, excess, near) <= 0, doubt)
+        return {"command": q - deviation, "deviation": deviation, "status": state}
 
-    def choose_back(
+    def choose_back(  # type: ignore[override]
         self, q: Tensor, strange: Tensor, first: Tensor, correction: Tensor, excess: Tensor, doubt: Tensor
-    ) -> Sequence[Tensor]:
-        ideal, _, state = self.choose(q, strange, first, excess, correction, excess, doubt)
-        return ideal, state
+    ) -> Variables:
+        found = self.choose(q, strange, first, excess, correction, excess, doubt)
+        return {"joints": found["command"], "status": found["status"]}

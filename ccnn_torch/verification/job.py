@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from torch import Tensor
 
-from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
+from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap
 from ccnn_torch.display import count_text
 from ccnn_torch.mechanisms import PoseError, as_measured
@@ -37,7 +37,7 @@ _SUSPECT = 0.5
 
 
 def verify_model(
-    model: LoadedModel | IdentifiedGeometry,
+    model: LoadedModel,
     records: Any,
     mechanism: str | None = None,
     compensated: bool = False,

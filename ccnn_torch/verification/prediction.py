@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
+from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, load_mechanism, mechanism_from_description
 from ccnn_torch.mechanisms.frames.fit import rigid_body_frame
@@ -42,13 +42,13 @@ class Rows:
 
 
 def nominal_mechanism(
-    model: LoadedModel | IdentifiedGeometry, spec: str | None, allow_code: bool, keys: Mapping[str, Any] | None = None
+    model: LoadedModel, spec: str | None, allow_code: bool, keys: Mapping[str, Any] | None = None
 ) -> Mechanism:
     """The nominal machine that the model was made for, its frames as they were fitted then."""
     about = model.facts["mechanism"]
     if spec is None:
-        if isinstance(model, IdentifiedGeometry):
-            return model.nominal
+        if model.machine is not None:
+            return model.machine.nominal
         with code_refused(f"{model.path}: its mechanism", allow_code):
             return mechanism_from_description(about, allow_code=True)
     given = load_mechanism(spec, **(keys or {}))
@@ -64,9 +64,7 @@ def nominal_mechanism(
     return given
 
 
-def mapped_columns(
-    model: LoadedModel | IdentifiedGeometry, records: Any, machine: Mechanism
-) -> tuple[dict[str, str], dict[str, str]]:
+def mapped_columns(model: LoadedModel, records: Any, machine: Mechanism) -> tuple[dict[str, str], dict[str, str]]:
     """The maps of columns and of joints that the model's run had, as far as the new rows have these headers."""
     if isinstance(records, Records) or not (model.columns or model.joint_map):
         return {}, {}
@@ -77,7 +75,7 @@ def mapped_columns(
     return columns, model.joint_map if shown else {}
 
 
-def predict(model: LoadedModel | IdentifiedGeometry, machine: Mechanism, records: Records, compensated: bool) -> Rows:
+def predict(model: LoadedModel, machine: Mechanism, records: Records, compensated: bool) -> Rows:
     for key in ("frame_per", "tool_per"):
         if getattr(machine, key, ()):
             raise InputError(
@@ -89,8 +87,8 @@ def predict(model: LoadedModel | IdentifiedGeometry, machine: Mechanism, records
     found = model(records.joints.numpy(), _covariates(model, records))
     ideal = torch.from_numpy(np.asarray(found["ideal"]))
     nominal = machine.forward_kinematics(records.joints, guess=pose)
-    if isinstance(model, IdentifiedGeometry):
-        real = model.identified
+    if model.machine is not None:
+        real = model.machine.identified
         if isinstance(real, SerialArm) and len(machine.pose) == 3:
             real = real.with_orientation("none")
         predicted = real.forward_kinematics(records.joints, guess=pose)
@@ -106,16 +104,16 @@ def predict(model: LoadedModel | IdentifiedGeometry, machine: Mechanism, records
     return Rows(machine, records.joints, pose, ideal - records.joints, inside, nominal, predicted)
 
 
-def _covariates(model: LoadedModel | IdentifiedGeometry, records: Records) -> np.ndarray[Any, Any] | None:
+def _covariates(model: LoadedModel, records: Records) -> np.ndarray[Any, Any] | None:
     """The model's covariates, `s x m` [SI], a constant one as well, which a run would have dropped."""
     if not model.covariates:
         return None
     return np.stack([records.columns[c.name] for c in model.covariates], axis=-1)
 
 
-def pseudoerror_settings(model: LoadedModel | IdentifiedGeometry, machine: Mechanism) -> dict[str, Any]:
+def pseudoerror_settings(model: LoadedModel, machine: Mechanism) -> dict[str, Any]:
     """How the joint deviations of a run were found: as the card has it."""
-    card = {} if isinstance(model, IdentifiedGeometry) else model.card
+    card = model.card
     damping = float(card.get("damping", _ARM_DAMPING if isinstance(machine, SerialArm) else 0.0))
     return {
         "rotation_weight": float(card.get("rotation_weight", _ROTATION_WEIGHT)),

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
+from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.report.json_files import read_json
@@ -112,9 +112,9 @@ def _spread(values: Tensor, groups: Tensor) -> float:
     return float(count * variance / mean**2)
 
 
-def promise_of(model: LoadedModel | IdentifiedGeometry) -> dict[str, Any] | None:
+def promise_of(model: LoadedModel) -> dict[str, Any] | None:
     """The card's promise, or that of the identified.json beside an identified.yaml, which no signature covers."""
-    if isinstance(model, LoadedModel):
+    if model.machine is None:
         metrics = model.card.get("metrics")
         found = metrics.get("promise") if isinstance(metrics, dict) else None
         return found if isinstance(found, dict) else None
@@ -125,6 +125,6 @@ def promise_of(model: LoadedModel | IdentifiedGeometry) -> dict[str, Any] | None
     promise, parameters = results.get("promise"), results.get("parameters")
     if not isinstance(promise, dict) or not isinstance(parameters, dict):
         return None
-    own = model.identified.describe()["parameters"]
+    own = model.machine.identified.describe()["parameters"]
     same = all(math.isclose(own.get(name, math.nan), block["value"]) for name, block in parameters.items())
     return promise if same else None

@@ -14,7 +14,7 @@ from stand_ins import Sigmoids, arm_compensator, tripod_compensator, tripod_join
 from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, fit_compensator
-from ccnn_torch.compensation.contraction import Steepness, iterations_needed
+from ccnn_torch.compensation.fit import Steepness, iterations_needed
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners.constant import ConstantNetwork

@@ -14,8 +14,9 @@ from fitted import LIMITS, six_axis_arm
 from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.compensation import IdentifiedGeometry, load_compensation
-from ccnn_torch.compensation.wanted_poses import WantedPoses
+from ccnn_torch.compensation import load_compensation
+from ccnn_torch.compensation.job import WantedPoses
+from ccnn_torch.compensation.model_files.identified import model_of_machine
 from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
 from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError
@@ -41,7 +42,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_its_commands_bring_the_machine_to_the_nominal_pose(found: Path) -> None:
     model = load_compensation(found)
-    assert isinstance(model, IdentifiedGeometry)
+    assert model.machine is not None
     names = [c.name for c in model.covariates]
     assert {"direction1", "direction2"} <= set(names) and "temperature" not in names
     region = model.machine.rows(50)
@@ -50,9 +51,9 @@ def test_its_commands_bring_the_machine_to_the_nominal_pose(found: Path) -> None
     exact = torch.from_numpy(answer["status"] < 2)
     # Corners of the box are out of its reach.
     assert float(exact.double().mean()) > 0.7
-    there = Situation(model.nominal, torch.from_numpy(answer["command"]), given, region.gravity)
+    there = Situation(model.machine.nominal, torch.from_numpy(answer["command"]), given, region.gravity)
     pose = measured_pose(there, reached(there, model.machine.acting, model.machine.values))
-    wanted = model.nominal.forward_kinematics(region.joints)
+    wanted = model.machine.nominal.forward_kinematics(region.joints)
     torch.testing.assert_close(pose[exact], wanted[exact], rtol=0, atol=5e-7)
     with pytest.raises(InputError, match=r"needs the covariates .*direction1"):
         model(region.joints.numpy())
@@ -60,9 +61,9 @@ def test_its_commands_bring_the_machine_to_the_nominal_pose(found: Path) -> None
 
 def test_it_is_a_mechanism(found: Path) -> None:
     machine, known = load_mechanism(str(found)), load_compensation(found)
-    assert isinstance(machine, FiveBar) and isinstance(known, IdentifiedGeometry)
+    assert isinstance(machine, FiveBar) and known.machine is not None
     torch.testing.assert_close(machine.nominal, known.machine.values, rtol=0, atol=0)
-    assert not torch.equal(machine.nominal, known.nominal.nominal)
+    assert not torch.equal(machine.nominal, known.machine.nominal.nominal)
     with pytest.raises(InputError, match=r"mechanism_keys: .* leave out l"):
         load_mechanism(str(found), l=0.3)
 
@@ -114,15 +115,15 @@ def test_without_a_machine_it_says_what_to_do(tmp_path: Path) -> None:
 
 
 def test_gravity_of_the_rows_is_that_of_the_machine(found: Path) -> None:
-    machine = load_compensation(found)
-    assert isinstance(machine, IdentifiedGeometry)
-    torch.testing.assert_close(machine.machine.gravity, default_gravity(load_mechanism("five_bar")), rtol=0, atol=0)
+    machine = load_compensation(found).machine
+    assert machine is not None
+    torch.testing.assert_close(machine.gravity, default_gravity(load_mechanism("five_bar")), rtol=0, atol=0)
 
 
 def test_the_first_pose_is_reached_on_the_branch_that_was_measured(tmp_path: Path) -> None:
     arm, none = six_axis_arm(), torch.zeros(0, 2, dtype=torch.float64)
     about = (default_gravity(arm), torch.tensor(LIMITS, dtype=torch.float64), (), none, {}, {})
-    model = IdentifiedGeometry(tmp_path / "diagnosis.json", FoundMachine(arm, arm.nominal, [], *about))
+    model = model_of_machine(tmp_path / "diagnosis.json", FoundMachine(arm, arm.nominal, [], *about))
     joints = arm.sample_joints(100, torch.Generator().manual_seed(4))
     # From the middle of the region the solver goes to another branch in these.
     for row in (15, 40, 78):

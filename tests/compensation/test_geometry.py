@@ -18,8 +18,8 @@ from ccnn_torch.compensation import (
     load_model,
     save_model,
 )
-from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
-from ccnn_torch.compensation.model_files.onnx_session import check_graph, open_onnx
+from ccnn_torch.compensation.expansions import ChebyshevExpansion
+from ccnn_torch.compensation.model_files.metadata import check_graph, open_onnx
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.mechanisms import Mechanism
 

@@ -29,12 +29,10 @@ from stand_ins import fields
 from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, Solution, load_model, save_model
-from ccnn_torch.compensation.agreement import probe_points
-from ccnn_torch.compensation.machine.alone import all_over, machine_alone
-from ccnn_torch.compensation.machine.inverse import InverseMachine
-from ccnn_torch.compensation.machine.machine import SETTLED, Machine, limits_of
+from ccnn_torch.compensation.machine import SETTLED, InverseMachine, Machine, limits_of
+from ccnn_torch.compensation.parts import all_over, machine_alone
 from ccnn_torch.compensation.targets.from_model import form_of
-from ccnn_torch.compensation.targets.run import run_form
+from ccnn_torch.compensation.targets.golden import probe_points, run_form
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
@@ -66,7 +64,7 @@ def solved(made: Compensator, joints: Tensor, covariates: Tensor | None = None) 
 def reached(machine: Known, made: Compensator, command: Tensor, covariates: Tensor) -> Tensor:
     """Frame of the true machine, which is the identified one with what was learned, `s x c`."""
     learned = made.learned(command, covariates if made.covariates else None)
-    return machine.frame(command + learned, made._held(covariates))
+    return machine.frame(command + learned, made.held(covariates))
 
 
 def wanted(machine: Known, joints: Tensor) -> Tensor:

@@ -32,9 +32,9 @@ from ccnn_torch.compensation import (
     load_model,
     save_model,
 )
-from ccnn_torch.compensation.agreement import probe_points
-from ccnn_torch.compensation.export.export import verify
-from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS
+from ccnn_torch.compensation.model_files.metadata import OUTPUTS
+from ccnn_torch.compensation.targets.golden import probe_points
+from ccnn_torch.compensation.targets.onnx_export import verify
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.mechanisms import Tripod, load_mechanism
@@ -391,5 +391,5 @@ def test_memory_that_runs_out_while_a_model_is_read_is_no_fault_of_it(
 
     for name, where in (("model.safetensors", "_rebuild"), ("model.onnx", "open_onnx")):
         with monkeypatch.context() as patched, pytest.raises(MemoryError):
-            patched.setattr(f"ccnn_torch.compensation.model_files.master.{where}", full)
+            patched.setattr(f"ccnn_torch.compensation.model_files.metadata.{where}", full)
             load_model(copied / name)

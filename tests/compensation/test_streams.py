@@ -17,10 +17,9 @@ from scipy.spatial.transform import Rotation
 from stand_ins import Sigmoids, fields, tripod_joints
 from torch import Tensor
 
-from ccnn_torch.compensation import Compensator, IdentifiedGeometry, load_compensation, register_network, save_model
-from ccnn_torch.compensation.job import sentences, write_compensated
+from ccnn_torch.compensation import Compensator, LoadedModel, load_compensation, register_network, save_model
+from ccnn_torch.compensation.job import WantedPoses, sentences, write_compensated
 from ccnn_torch.compensation.model_files.identified import load_geometry
-from ccnn_torch.compensation.wanted_poses import WantedPoses
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.mechanisms.mechanism_file import write_machine
@@ -190,7 +189,7 @@ def test_texts_are_repeated_and_run_in_no_spreadsheet(folder: Path, tmp_path: Pa
     assert all(float(row["q1[m]"]) == 1.12 for row in rows)
 
 
-class Statuses(IdentifiedGeometry):
+class Statuses(LoadedModel):
     """Says of every row how it was found: exact, outside, no number, damped, damped, …"""
 
     def __call__(self, joints: ArrayLike, covariates: ArrayLike | None = None) -> dict[str, Any]:
@@ -255,8 +254,8 @@ def identified(tmp_path: Path) -> Path:
 
 def test_another_tool_in_another_frame_reaches_the_pose(identified: Path, tmp_path: Path, cli: Cli) -> None:
     loaded = load_compensation(identified)
-    assert isinstance(loaded, IdentifiedGeometry)
-    real = loaded.identified
+    assert loaded.machine is not None
+    real = loaded.machine.identified
     assert isinstance(real, SerialArm)
     tool, base = [0.01, 0.0, 0.12, 0.0, np.pi / 2, 0.0], [1.0, -0.5, 0.2, 0.0, 0.0, 0.3]
     joints = real.home_joints + 0.3 * torch.rand(9, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ccnn_torch import export_model
 from ccnn_torch.compensation import Compensator, fit_compensator, load_model, save_model
-from ccnn_torch.compensation.model_files.onnx_session import open_onnx
+from ccnn_torch.compensation.model_files.metadata import open_onnx
 from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError

@@ -24,15 +24,14 @@ from torch import Tensor
 
 from ccnn_torch import export_model
 from ccnn_torch.compensation import Compensator
-from ccnn_torch.compensation.export.export import export_float32
 from ccnn_torch.compensation.model_files.identified import load_geometry
-from ccnn_torch.compensation.model_files.onnx_session import open_onnx
-from ccnn_torch.compensation.targets import from_graph
+from ccnn_torch.compensation.model_files.metadata import open_onnx
+from ccnn_torch.compensation.targets import from_model
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of, traced_program
-from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
-from ccnn_torch.compensation.targets.run import run_form, run_program
+from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal, run_form, run_program
+from ccnn_torch.compensation.targets.onnx_export import export_float32
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import load_mechanism
@@ -160,8 +159,8 @@ def test_structured_text_is_parsed_and_gives_the_numbers(kind: str, monkeypatch:
     dtype = "float32" if single else "float64"
     if arrays:
         # As in a large model, whose parser would take minutes.
-        monkeypatch.setattr(from_graph, "_ELEMENTS", 2)
-        monkeypatch.setattr(from_graph, "_PRODUCTS", 4)
+        monkeypatch.setattr(from_model, "_ELEMENTS", 2)
+        monkeypatch.setattr(from_model, "_PRODUCTS", 4)
     compensator.secant = arrays
     form, golden = made(compensator, dtype, sd=single)
     files = print_structured_text(form, golden)

@@ -22,13 +22,12 @@ from structured_text import Instance, parse_blocks
 from test_targets import STRICT
 
 from ccnn_torch.compensation import Compensator
-from ccnn_torch.compensation.export.export import export_onnx
-from ccnn_torch.compensation.model_files.onnx_session import open_onnx, run_onnx
+from ccnn_torch.compensation.model_files.metadata import open_onnx, run_onnx
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of
-from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
-from ccnn_torch.compensation.targets.run import run_form
+from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal, run_form
+from ccnn_torch.compensation.targets.onnx_export import export_onnx
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.errors import MethodFailedError
 
@@ -147,7 +146,7 @@ def promised(compensator: Compensator, form: Form, joints: Array, covariates: Ar
     given = torch.from_numpy(joints), None if covariates is None else torch.from_numpy(covariates)
     with torch.no_grad():
         found = compensator.solve(*given)
-        clean, _, strange = compensator._inputs(*given)
+        clean, strange = compensator.domain.clean(compensator._inputs(*given))
         sd = compensator.sd(*given)
     lost = (strange > 0).numpy()
     return {

@@ -1,24 +1,102 @@
-"""Metadata of a model file: one JSON text, the same in the master and in every export, and the form that it has."""
+"""What a model file says of itself, the same in the master and every export, and a way to run it without its code."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, Any
 
+import onnx
+import onnxruntime
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+from numpy.typing import NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state as runtime
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
 from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.model_files.onnx_session import TAKE_AGAIN
-from ccnn_torch.compensation.networks import describe_network
+from ccnn_torch.compensation.domain import Domain
+from ccnn_torch.compensation.networks import describe_network, network_from_description
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.errors import InputError, ModelFileError
-from ccnn_torch.training import tensor_digest
+from ccnn_torch.errors import InputError, ModelFileError, raise_if_out_of_memory
+from ccnn_torch.training import Scaling, tensor_digest
 from ccnn_torch.version import __version__
+
+Array = NDArray[Any]
+
+# How sentences about a touched file end.
+TAKE_AGAIN = "; take it again from where it was written"
+
+METADATA_KEY = "ccnn_torch"
+OUTPUTS = (
+    *("command", "deviation", "inside_domain", "ideal", "ideal_inside_domain", "deviation_sd"),
+    *("status", "ideal_status"),
+)
+
+# What a graph or a module of another kind than ours may raise. ONNX Runtime's errors have no common class.
+RUN_ERRORS: tuple[type[Exception], ...] = (
+    *(RuntimeError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError, MemoryError),
+    *(v for v in vars(runtime).values() if isinstance(v, type) and issubclass(v, Exception)),
+)
+
+
+def said(reason: Exception) -> str:
+    """Message of such an error, short enough for a sentence: it contains names from the file."""
+    return " ".join("".join(c if c.isprintable() else " " for c in str(reason)).split())[:200] or type(reason).__name__
+
+
+def check_graph(model: onnx.ModelProto) -> None:
+    """Refuse what our exports do not have: other files, operators of other libraries, loops and branches.
+
+    Raises:
+        ModelFileError: names what it is.
+    """
+    if model.functions:
+        raise ModelFileError(f"its graph has a function of its own ({model.functions[0].name})" + TAKE_AGAIN)
+    for node in model.graph.node:
+        if node.domain not in ("", "ai.onnx"):
+            raise ModelFileError(f"its graph has an operator of another library ({node.domain})" + TAKE_AGAIN)
+        if any(a.HasField("g") or a.graphs for a in node.attribute):
+            raise ModelFileError(f"its graph has a loop or a branch ({node.op_type})" + TAKE_AGAIN)
+    for tensor in _tensors(model.graph):
+        if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
+            raise ModelFileError(f"its graph reads another file ('{tensor.name}' is stored outside)" + TAKE_AGAIN)
+
+
+def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
+    yield from graph.initializer
+    sparse = [*graph.sparse_initializer]
+    for attribute in (a for node in graph.node for a in node.attribute):
+        yield from (attribute.t, *attribute.tensors)
+        sparse += [attribute.sparse_tensor, *attribute.sparse_tensors]
+    for tensor in sparse:
+        yield from (tensor.values, tensor.indices)
+
+
+def open_onnx(content: bytes) -> onnxruntime.InferenceSession:
+    """A session on one thread: for one command, more only add jitter."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    # Not by what the bytes look like.
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    # Else it prints what is wrong with a file, and tries the same again.
+    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
+
+
+def run_onnx(session: onnxruntime.InferenceSession, joints: Array, covariates: Array | None) -> dict[str, Array]:
+    """joints: `s x n`; covariates: `s x m` or None; returns the outputs by name."""
+    feeds = {"joints": joints} if covariates is None else {"joints": joints, "covariates": covariates}
+    names = [output.name for output in session.get_outputs()]
+    return dict(zip(names, session.run(names, feeds), strict=True))
+
 
 _FORMATS = "ccnn_torch compensator "
 FORMAT = f"{_FORMATS}6"
@@ -44,19 +122,19 @@ class _Form(BaseModel):
     model_config = ConfigDict(strict=True, extra="ignore")
 
 
-class _Coordinate(_Form):
+class Axis(_Form):
     name: str
     unit: str
 
 
-class _Mechanism(_Form):
+class MadeFor(_Form):
     name: str = ""
     joints: list[str] = []
     pose: list[str] = []
     parameters: dict[str, _Number] = {}
 
 
-class _Limit(_Form):
+class Limit(_Form):
     limit: _Size
     most_deviation: _Size
     safe_correction: _Number
@@ -64,12 +142,12 @@ class _Limit(_Form):
     sd_scale: _Size
 
 
-class _Edge(_Form):
+class Edge(_Form):
     low: _Number
     high: _Number
 
 
-class _Principal(_Form):
+class Principal(_Form):
     centre: list[_Number]
     half_range: list[_Scale]
     directions: list[list[_Number]]
@@ -77,36 +155,67 @@ class _Principal(_Form):
     high: list[_Number]
 
 
-class _Domain(_Form):
-    inputs: dict[str, _Edge]
-    principal: _Principal
+class Inside(_Form):
+    inputs: dict[str, Edge]
+    principal: Principal
 
 
-class _Effects(_Form):
+class Acting(_Form):
     # Name, number of shapes, number of coefficients of each.
     acting: list[list[str | Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = []
 
 
-class _Machine(_Form):
+class Closed(_Form):
     degree: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
     newton: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
-    effects: _Effects | None = None
+    effects: Acting | None = None
 
 
-class _Facts(_Form):
-    mechanism: _Mechanism
-    joints: Annotated[list[_Coordinate], Field(min_length=1)]
-    covariates: list[_Coordinate]
-    pose: list[_Coordinate]
+class Facts(_Form):
+    mechanism: MadeFor
+    joints: Annotated[list[Axis], Field(min_length=1)]
+    covariates: list[Axis]
+    pose: list[Axis]
     network: dict[str, Any]
     geometry: dict[str, Any] = {}
-    effects: _Effects | None = None
-    machine: _Machine = _Machine()
-    domain: _Domain
-    limits: dict[str, _Limit]
+    effects: Acting | None = None
+    machine: Closed = Closed()
+    domain: Inside
+    limits: dict[str, Limit]
     lipschitz: _Size
     iterations: Annotated[int, Field(ge=0, le=_MOST_ITERATIONS)]
     secant: bool = False
+
+
+class PromisedErrors(_Form):
+    rows: int
+    configurations: int
+    position: dict[str, Any]
+    rotation: dict[str, Any] | None
+
+
+class Metrics(_Form):
+    promise: PromisedErrors | None = None
+    """what the held-out rows promise for new ones: ccnn verify holds a model to it"""
+
+
+class Card(Facts):
+    """card.json, the model card beside an exported compensator."""
+
+    format: str
+    files: Annotated[dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]], Field(min_length=1)]
+    """file name -> SHA-256 of the whole file, hexadecimal"""
+    data_sha256: str | None
+    metrics: Metrics | None
+    seed: int | None
+    versions: dict[str, str]
+    sha256: dict[str, str]
+    columns: dict[str, str] | None = {}
+    """header in the records -> name[unit] or ignore"""
+    joint_map: dict[str, str] | None = {}
+    """joint -> sum of columns, where its controller counts otherwise"""
+    date: str
+    notes: list[str]
 
 
 def fingerprint(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -144,7 +253,7 @@ def description_of(compensator: Compensator) -> dict[str, Any]:
         "network": describe_network(compensator.network),
         "domain": compensator.domain.describe(compensator.joints + compensator.covariates),
         "limits": {
-            c.name: {"unit": c.unit, **dict(zip(_Limit.model_fields, values, strict=True))}
+            c.name: {"unit": c.unit, **dict(zip(Limit.model_fields, values, strict=True))}
             for c, *values in zip(compensator.joints, *limits, strict=True)
         },
         "lipschitz": compensator.lipschitz,
@@ -181,7 +290,7 @@ def read_facts(text: Any) -> dict[str, Any]:
     if to_json(facts) != text:
         raise ModelFileError("its metadata was edited after it was written")
     try:
-        form = _Facts.model_validate(facts)
+        form = Facts.model_validate(facts)
     except ValidationError as problem:
         first = problem.errors()[0]
         key = ".".join(map(str, first["loc"]))
@@ -244,3 +353,131 @@ def _digest(facts: Mapping[str, Any]) -> str:
     """SHA-256 of everything but itself; that of the tensors is among it."""
     others = {key: value for key, value in facts["sha256"].items() if key != "keys"}
     return hashlib.sha256(to_json({**facts, "sha256": others}).encode()).hexdigest()
+
+
+def open_model(path: Path, content: bytes) -> tuple[dict[str, Any], Compensator | None, Any]:
+    """Facts, and the module or a session of ONNX Runtime, by what the name ends in.
+
+    Raises:
+        ModelFileError: it is no model of ours; without the path.
+    """
+    if path.suffix == ".safetensors":
+        return *_open_master(content), None
+    facts, session = _open_onnx(content)
+    return facts, None, session
+
+
+def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
+    try:
+        tensors = load_tensors(content)
+        # The header's length is in the first eight bytes, the header behind it; load() keeps it to itself.
+        header = from_json(content[8 : 8 + int.from_bytes(content[:8], "little")])
+    except (SafetensorError, ValueError, KeyError):
+        raise ModelFileError("it is damaged, or no safetensors file" + TAKE_AGAIN) from None
+    facts = read_facts(header.get("__metadata__", {}).get(METADATA_KEY))
+    try:
+        check_tensors(facts, tensors)
+        compensator = _rebuild(facts, tensors)
+        limits = [compensator.limit.tolist(), compensator.most.tolist()]
+    except RUN_ERRORS as reason:
+        raise_if_out_of_memory(reason)
+        raise ModelFileError(
+            f"its tensors are not those that its metadata lists ({said(reason)})" + TAKE_AGAIN
+        ) from None
+    if limits != [[facts["limits"][c["name"]][k] for c in facts["joints"]] for k in ("limit", "most_deviation")]:
+        raise ModelFileError("its limits are not those of its metadata" + TAKE_AGAIN)
+    return facts, compensator
+
+
+def _open_onnx(content: bytes) -> tuple[dict[str, Any], Any]:
+    try:
+        model = onnx.load_from_string(content)
+    except DecodeError:
+        raise ModelFileError("it is damaged, or no ONNX file" + TAKE_AGAIN) from None
+    facts = read_facts({entry.key: entry.value for entry in model.metadata_props}.get(METADATA_KEY))
+    if any(i.type.tensor_type.elem_type == onnx.TensorProto.FLOAT for i in model.graph.input):
+        raise ModelFileError(
+            "this is the single precision variant for controllers, which gives one row's deviation; use the .onnx "
+            "file without 'float32' in its name"
+        )
+    check_graph(model)
+    inputs = ["joints", "covariates"] if facts["covariates"] else ["joints"]
+    if [i.name for i in model.graph.input] != inputs or not {*OUTPUTS} <= {o.name for o in model.graph.output}:
+        raise ModelFileError(f"its graph does not take {', '.join(inputs)} and give {', '.join(OUTPUTS)}" + TAKE_AGAIN)
+    try:
+        return facts, open_onnx(content)
+    except RUN_ERRORS as reason:
+        raise_if_out_of_memory(reason)
+        raise ModelFileError(f"ONNX Runtime does not take its graph ({said(reason)})" + TAKE_AGAIN) from None
+
+
+def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensator:
+    """The module out of its description and tensors."""
+    parts: dict[str, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        part, _, rest = name.partition(".")
+        parts.setdefault(part, {})[rest] = value
+
+    def made(key: str) -> Any:
+        if key not in facts:
+            return None
+        module = network_from_description(facts[key])
+        module.load_state_dict(parts.get(key, {}))
+        return module
+
+    return Compensator(
+        made("network").requires_grad_(False),
+        Scaling(**parts["scaling"]),
+        Domain(**parts["domain"]),
+        tensors["limit"],
+        tensors["safe"],
+        coordinates(facts["joints"]),
+        coordinates(facts["covariates"]),
+        facts["lipschitz"],
+        facts["iterations"],
+        tensors["sd_scale"],
+        tensors["safe_sd"],
+        made("geometry"),
+        made("effects"),
+        facts.get("secant", False),
+        made("machine"),
+        tensors["most"],
+    )
+
+
+def card_of(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
+    """The card in the file's folder that lists the SHA-256 of these bytes, under any name; and the card's bytes.
+
+    Raises:
+        ModelFileError: there is none, or a card is damaged.
+    """
+    digest = hashlib.sha256(content).hexdigest()
+    names = sorted({path.parent / "card.json", *path.parent.glob("*.card.json")})
+    present = [name for name in names if name.is_file()]
+    if not present:
+        raise ModelFileError(
+            f"{path}: there is no card.json beside it to vouch for it; copy the card from the folder it was written "
+            "to, or name a model file"
+        )
+    for name in present:
+        try:
+            text = name.read_bytes()
+            card = from_json(text)
+        except OSError as reason:
+            raise ModelFileError(f"{name}: cannot be read: {reason.strerror}") from None
+        except ValueError:
+            raise ModelFileError(f"{name}: this card is damaged; take it again from where it was written") from None
+        files = card.get("files") if isinstance(card, dict) else None
+        if isinstance(files, dict) and digest in files.values():
+            found: dict[str, Any] = card
+            for key in ("columns", "joint_map"):
+                told = found.get(key) or {}
+                if not isinstance(told, dict) or not all(isinstance(value, str) for value in told.values()):
+                    raise ModelFileError(
+                        f"{name}: {key} is no table of names and texts; take the card again from where it was written"
+                    )
+            return found, text
+    raise ModelFileError(
+        f"{path}: its SHA-256 is in none of the cards beside it ({', '.join(name.name for name in present)}): the file "
+        "is damaged, altered or foreign; take it again from where it was written, with its card"
+    )

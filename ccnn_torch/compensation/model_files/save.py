@@ -11,9 +11,8 @@ from typing import Any
 from safetensors.torch import save
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.export.export import export_float32, export_onnx
-from ccnn_torch.compensation.model_files.metadata import OPTIONAL, fingerprint, to_json
-from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
+from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, OPTIONAL, fingerprint, to_json
+from ccnn_torch.compensation.targets.onnx_export import export_float32, export_onnx
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.files.write import write_whole
 

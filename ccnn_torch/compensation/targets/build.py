@@ -26,8 +26,10 @@ from ccnn_torch.compensation.targets.form import (
     Node,
     Program,
     leaves,
+    live_steps,
+    merge_axes,
+    put_loops_together,
 )
-from ccnn_torch.compensation.targets.simplify import live_steps, merge_axes, put_loops_together
 
 # Operands in whatever order are the same.
 _COMMUTATIVE = frozenset({"add", "mul", "min", "max", "eq", "and", "or"})

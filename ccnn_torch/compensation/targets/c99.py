@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from ccnn_torch.compensation.agreement import DAMPED_TOLERANCE
 from ccnn_torch.compensation.routines import Routine
 from ccnn_torch.compensation.targets.form import Array, Form, Program
-from ccnn_torch.compensation.targets.golden import Golden
+from ccnn_torch.compensation.targets.golden import DAMPED_TOLERANCE, Golden
 from ccnn_torch.compensation.targets.printing import (
     ARITHMETIC,
     Dialect,
     Text,
     costs,
+    filled,
     print_program,
     routine_lines,
     within,
     wrapped,
 )
-from ccnn_torch.compensation.targets.template import filled
 
 _NAMES = ("sqrt", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan", "floor")
 _FUNCTIONS = {name: f"{name}{{s}}({{{{0}}}})" for name in _NAMES}

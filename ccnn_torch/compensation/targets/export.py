@@ -8,23 +8,53 @@ from hashlib import sha256
 from pathlib import Path
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.export.export import export_onnx
-from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry, load_compensation
-from ccnn_torch.compensation.model_files.load import LoadedModel
+from ccnn_torch.compensation.model_files.load import LoadedModel, load_compensation
 from ccnn_torch.compensation.model_files.save import model_contents
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of
 from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
 from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
-from ccnn_torch.compensation.targets.robot import print_robot
+from ccnn_torch.compensation.targets.onnx_export import export_onnx
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.compensation.targets.table import print_tables
-from ccnn_torch.errors import InputError, ModelFileError
+from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
+from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
+from ccnn_torch.mechanisms.mechanism_file import dh_text, mjcf_text, urdf_text
 from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
+
+
+def print_robot(model: LoadedModel) -> dict[str, str]:
+    """Contents of the files by name: `robot.urdf`, `robot.xml` (MJCF), and `robot.yaml` where the arm has a DH table.
+
+    Raises:
+        MethodFailedError: the model has no identified links, or its machine is no serial arm.
+    """
+    arm = _arm(model)
+    texts = {"robot.urdf": urdf_text(arm), "robot.xml": mjcf_text(arm)}
+    return texts if arm.convention == "urdf" else texts | {"robot.yaml": dh_text(arm)}
+
+
+def _arm(model: LoadedModel) -> SerialArm:
+    if model.machine is not None:
+        arm = model.machine.identified
+        if isinstance(arm, SerialArm):
+            return arm
+        raise MethodFailedError(
+            f"a URDF is a tree, and '{arm.name}' is no serial arm; its parameters are in identified.yaml"
+        )
+    machine = None if model.compensator is None else model.compensator.machine
+    if machine is None or not isinstance(machine.mechanism, SerialArm):
+        raise MethodFailedError(
+            "this model has no identified links of an arm to write; train with geometry=identify, or give the "
+            "identified.yaml of ccnn identify"
+        )
+    arm = machine.real
+    assert isinstance(arm, SerialArm)
+    return arm
+
 
 DTYPES = ("float64", "float32")
 # What a controller needs: without the way back and the standard deviation a graph takes three quarters of the time.
@@ -36,14 +66,12 @@ class _Order:
     """What is to be exported, and how; the parts that targets need are made when they ask."""
 
     path: Path
-    model: LoadedModel | IdentifiedGeometry
+    model: LoadedModel
     dtype: str
     sd: bool
     allow_code: bool
 
     def compensator(self) -> Compensator:
-        if isinstance(self.model, IdentifiedGeometry):
-            return self.model.compensator
         if self.model.compensator is None:
             raise ModelFileError(f"{self.path}: an export is made of the master; give the .safetensors beside it")
         return self.model.compensator
@@ -62,13 +90,13 @@ class _Order:
     def source(self) -> str:
         name, file = self.model.facts["mechanism"].get("name") or "a machine", self.path.name
         told = f"{name}, written by ccnn_torch {__version__} from {file}"
-        if isinstance(self.model, LoadedModel):
+        if self.model.machine is None:
             return f"{told}, SHA-256 {self.model.card['files'][file]}"
         return told
 
     def mechanism(self) -> Mechanism:
-        if isinstance(self.model, IdentifiedGeometry):
-            return self.model.identified
+        if self.model.machine is not None:
+            return self.model.machine.identified
         described = self.model.facts["mechanism"]
         if "spec" not in described:
             raise ModelFileError(f"{self.path}: this target needs the machine's kinematics, which the model lacks")
@@ -76,26 +104,24 @@ class _Order:
 
 
 def _linuxcnc(order: _Order) -> dict[str, str]:
-    form = None if isinstance(order.model, IdentifiedGeometry) else order.proven()[0]
+    form = order.proven()[0] if order.model.machine is None else None
     return print_linuxcnc(form, order.mechanism(), order.source())
 
 
 def _onnx(order: _Order) -> dict[str, bytes | str]:
     compensator, model = order.compensator(), order.model
-    if isinstance(model, IdentifiedGeometry):
+    fields = model.card
+    if model.machine is not None:
         # Nothing was measured for this file but what identified the machine.
         digest = sha256(order.path.read_bytes()).hexdigest()
-        read = {"columns": model.columns, "joint_map": model.joint_map}
-        fields = model.facts | read | {"metrics": {}, "data_sha256": digest, "seed": 0}
-    else:
-        fields = model.card
+        fields = model.facts | fields | {"metrics": {}, "data_sha256": digest, "seed": 0}
     contents = model_contents(compensator, fields, forms=("onnx", "float32.onnx"))
     return dict(contents.values()) | {"controller.onnx": export_onnx(compensator, "{}", COMMAND)}
 
 
 def _table(order: _Order) -> dict[str, str]:
-    if isinstance(order.model, IdentifiedGeometry):
-        return print_tables(order.compensator(), order.model.nominal)
+    if order.model.machine is not None:
+        return print_tables(order.compensator(), order.model.machine.nominal)
     known = "spec" in order.model.facts["mechanism"]
     return print_tables(order.compensator(), order.mechanism() if known else None)
 

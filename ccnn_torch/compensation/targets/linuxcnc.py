@@ -8,8 +8,7 @@ from torch import Tensor
 from ccnn_torch.compensation.targets.c99 import c_compensation, c_constants, c_dialect, c_function
 from ccnn_torch.compensation.targets.form import Form, Program
 from ccnn_torch.compensation.targets.from_model import traced_program
-from ccnn_torch.compensation.targets.printing import costs, print_program, wrapped
-from ccnn_torch.compensation.targets.template import filled
+from ccnn_torch.compensation.targets.printing import costs, filled, print_program, wrapped
 from ccnn_torch.display import identifiers, plain, visible
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm

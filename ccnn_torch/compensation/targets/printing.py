@@ -7,6 +7,8 @@ import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +16,29 @@ from ccnn_torch.compensation.routines import Copy, Routine, Statement
 from ccnn_torch.compensation.targets.form import BOOLEAN, Array, Expression, Form, Leaf, Let, Loop, Program, leaves
 from ccnn_torch.display import plain
 from ccnn_torch.errors import MethodFailedError
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+
+def filled(template: str, **values: Any) -> str:
+    """A file's text; a name in the template that no value has is an error."""
+    return _environment().get_template(template).render(**values)
+
+
+@cache
+def _environment() -> Environment:
+    # Loaded with the package by everybody who compensates, and needed by who exports alone.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    return Environment(
+        loader=PackageLoader("ccnn_torch.compensation.targets"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+
 
 # What is used once is written where it is used, up to so many characters.
 _LONGEST = 90
@@ -173,19 +198,14 @@ def _loop_lines(step: Loop, dialect: Dialect, name: str, value: str) -> list[str
         at.append(f"{size} * i{d}" if size != 1 else f"i{d}")
         size *= n
     place = dialect.index.format(name, " + ".join(reversed(at)) or "0")
-    if step.reduce == "add":
-        added = dialect.store("sum", f"sum + {value}")
-        lines = [dialect.store("sum", dialect.literal(0.0))]
-        lines += dialect.loop(f"i{len(step.outer)}", step.shape[-1], [added])
-        lines += [dialect.store(place, "sum")]
-    elif step.reduce:
-        largest = dialect.store("sum", dialect.operations[step.reduce].format("sum", value))
-        # Lowest number of single precision: the first is above it.
-        lines = [dialect.store("sum", dialect.literal(-3e38))]
-        lines += dialect.loop(f"i{len(step.outer)}", step.shape[-1], [largest])
-        lines += [dialect.store(place, "sum")]
-    else:
-        lines = [dialect.store(place, value)]
+    lines = [dialect.store(place, value)]
+    if step.reduce:
+        start, more = 0.0, f"sum + {value}"
+        if step.reduce != "add":
+            # Lowest number of single precision: the first is above it.
+            start, more = -3e38, dialect.operations[step.reduce].format("sum", value)
+        inner = dialect.loop(f"i{len(step.outer)}", step.shape[-1], [dialect.store("sum", more)])
+        lines = [dialect.store("sum", dialect.literal(start)), *inner, dialect.store(place, "sum")]
     for d, n in reversed([*enumerate(step.outer)]):
         lines = dialect.loop(f"i{d}", n, lines)
     return lines

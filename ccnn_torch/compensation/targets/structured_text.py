@@ -15,12 +15,12 @@ from ccnn_torch.compensation.targets.printing import (
     Dialect,
     Text,
     costs,
+    filled,
     print_program,
     routine_lines,
     within,
     wrapped,
 )
-from ccnn_torch.compensation.targets.template import filled
 from ccnn_torch.errors import MethodFailedError
 
 # An argument of EXP beyond these would stop a controller; what it gives is 0 or without effect long before.

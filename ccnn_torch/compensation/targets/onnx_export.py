@@ -7,30 +7,129 @@ and none for Tan, Asin, Acos, Atan, Softplus, Elu, Gelu and Erf: a network made 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from itertools import count
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKernel
+from torch import Tensor
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
 
-from ccnn_torch.compensation.agreement import Vectors, probe_points
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.contraction import Steepness, iterations_needed
-from ccnn_torch.compensation.export.command import command_graph
-from ccnn_torch.compensation.model_files.onnx_session import (
-    OUTPUTS,
-    check_graph,
-    open_onnx,
-    run_onnx,
-)
+from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
+from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, OUTPUTS, check_graph, open_onnx, run_onnx
+from ccnn_torch.compensation.routines import KEPT, Functions, execute, routines_of
+from ccnn_torch.compensation.targets.golden import Vectors, probe_points
+from ccnn_torch.compensation.targets.onnx_graph import Graph, Value
+from ccnn_torch.compensation.targets.onnx_operations import ByTensors
 from ccnn_torch.errors import MethodFailedError
+
+# Rows of an example, or a few more.
+_LEAST = 61
+
+
+def rows_apart_from(module: torch.nn.Module) -> int:
+    """How many rows an example has, so that a length is a multiple of them only where it grows with the batch."""
+    tensors = [*module.state_dict().values(), *module.buffers()]
+    lengths = {n for tensor in tensors for n in tensor.shape if n}
+    primes = (p for p in count(_LEAST) if all(p % d for d in range(2, math.isqrt(p) + 1)))
+    return next(p for p in primes if all(n % p for n in lengths))
+
+
+def traced(function: Callable[..., Any], *example: Tensor) -> GraphModule:
+    """A function of tensors whose first axis is the batch, by running it."""
+    with torch.no_grad():
+        return make_fx(lambda *given: function(*given), tracing_mode="real", pre_dispatch=True)(*example)
+
+
+# In the graph their numbers are there, so that command + deviation is the joints to the last digit.
+_SOLID = frozenset({"ideal", "correction", "found"})
+
+
+class GraphFunctions(Functions):
+    """Those of a graph, in which every operation costs as much as a matrix product: fewer of them."""
+
+    def excess(self, caged: Tensor) -> Tensor:
+        domain = self.own.domain
+        away = (caged - domain.centre) @ domain._axes - domain.middle
+        # Both sides at once: an absolute value would be one more operation between two products.
+        beyond = torch.relu(torch.cat([away - domain.radius, -away - domain.radius], -1) / domain.width.repeat(2))
+        return (beyond * beyond) @ domain._ones.repeat(2, 1)
+
+    def faded(self, raw: Tensor, weight: Tensor, known: Tensor) -> Tensor:
+        limit, safe = self.own.limit, self.own.safe
+        # In units of the limit, with a column of ones that becomes the weight: δ is a linear form of one array then.
+        unit = torch.where(limit > 0, limit, torch.ones_like(limit))
+        both = weight * torch.clamp(torch.cat([raw / unit, torch.ones_like(weight)], -1), -1.0, 1.0)
+        return both[..., : self.joints] * limit - both[..., self.joints :] * safe + known * safe
+
+
+def command_graph(
+    compensator: Compensator, opset: int, metadata: str, outputs: Sequence[str], dtype: str = "float64"
+) -> onnx.ModelProto:
+    """Both directions as one graph.
+
+    Args:
+        outputs: which ones, in order: those of `Solution`, or `deviation`, `guard`, `back_deviation`, `back_guard`.
+        dtype: in which the graph computes; single precision is for one row.
+
+    Raises:
+        MethodFailedError: the model has an operation that no file has.
+    """
+    n, m = len(compensator.joints), len(compensator.covariates)
+    rows, functions = rows_apart_from(compensator), GraphFunctions(compensator)
+    examples = functions.start(compensator.domain.centre.repeat(rows, 1))
+    routines = routines_of(compensator, KEPT)
+    with torch.no_grad():
+        for routine in routines:
+            functions.run(routine.statements, examples)
+    nothing = examples["aim"][:, :0]
+    batch: str | int = 1 if dtype == "float32" else "batch"
+    graph = Graph(rows, opset, dtype)
+    given = graph.input("joints", n, batch)
+    if m:
+        # No linear form: an infinite number times 0 would be none.
+        names = [given.name, graph.input("covariates", m, batch).name]
+        given = graph.node("Concat", names, (rows, n + m), (rows, n + m), axis=1)
+    lowering = ByTensors(graph)
+    known: dict[tuple[str, int], tuple[GraphModule, list[str]]] = {}
+
+    def call(name: str, values: dict[str, Any]) -> dict[str, Any]:
+        inputs = {i: values[i] for i in functions.inputs_of(name)}
+        if name.startswith("finish"):
+            inputs |= {i: graph.solid(v) for i, v in inputs.items() if i in _SOLID and isinstance(v, Value)}
+        # Steps of Broyden's method become more.
+        key = name, values["steps"].shape[-1] if name == "following" else 0
+        if key not in known:
+            steps = {"steps": torch.zeros(rows, key[1], dtype=torch.float64)}
+            # A tensor of its own for each: the tracer takes equal tensors for one input.
+            own = [(examples | steps)[i].clone() for i in inputs]
+            with torch.no_grad():
+                given = [*getattr(functions, name)(*own)]
+            known[key] = traced(lambda *v: [*getattr(functions, name)(*v).values()], *own), given
+        module, given = known[key]
+        return dict(zip(given, lowering.run(module, [*inputs.values()]), strict=True))
+
+    def zeros(name: str) -> Tensor:
+        return nothing if name == "steps" else torch.zeros(rows, n, dtype=torch.float64)
+
+    found: dict[str, Any] = {"inputs": given, "aim": nothing}
+    for routine in routines:
+        execute(routine.statements, found, call, zeros)
+    model = graph.model({name: found[name] for name in outputs}, batch, "compensator")
+    model.metadata_props.add(key=METADATA_KEY, value=metadata)
+    return model
+
 
 _OPSET = 20
 _OPSET_FLOAT32 = 17
-# Of the correction limit: what a network may ask for, and what single precision gives.
+# Of the correction limit: what a network may ask for.
 _LOOSEST = 1e-9
-_TOLERANCE_FLOAT32 = 1e-5
 _OUTPUTS_FLOAT32 = ("deviation", "guard", "back_deviation", "back_guard")
 
 
@@ -79,7 +178,7 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
         raise MethodFailedError(f"the {what} need double precision; use the float64 file")
     twin = copy.copy(compensator)
     if not twin.secant:
-        twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
+        twin.iterations = single_steps(compensator)
     joints, covariates = probe_points(compensator)
     given = [v.float() for v in (joints, covariates) if v is not None]
     model = command_graph(twin, _OPSET_FLOAT32, metadata, _OUTPUTS_FLOAT32, "float32")
@@ -87,12 +186,12 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     session = open_onnx(content)
     with torch.no_grad():
         expected = compensator.guarded(*(v.double() for v in given))
-    tolerance = _TOLERANCE_FLOAT32 * compensator.limit.numpy()
+    tolerance = SINGLE_TOLERANCE * compensator.limit.numpy()
     for row in range(len(joints)):
         one = [v[row : row + 1].numpy() for v in given]
         found = run_onnx(session, one[0], one[1] if len(one) > 1 else None)
         for name, wanted in zip(_OUTPUTS_FLOAT32, expected, strict=True):
-            allowed = 10 * _TOLERANCE_FLOAT32 if "guard" in name else tolerance
+            allowed = 10 * SINGLE_TOLERANCE if "guard" in name else tolerance
             if not bool((np.abs(found[name].astype(np.float64) - wanted[row].numpy()) <= allowed).all()):
                 raise MethodFailedError(
                     f"single precision does not hold this model: its output '{name}' is off by more than 1e-5 of the "

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.fx import Node
 
-from ccnn_torch.compensation.export.graph import Graph, Value, batch_of
 from ccnn_torch.compensation.lowering import Lowering, operation_of
+from ccnn_torch.compensation.targets.onnx_graph import Graph, Value, batch_of
 from ccnn_torch.errors import MethodFailedError
 
 _NAMES = {

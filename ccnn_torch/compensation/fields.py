@@ -17,9 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion, expand
-from ccnn_torch.compensation.geometry.closed_form import ClosedKinematics
-from ccnn_torch.compensation.geometry.trigonometric import TrigonometricExpansion, expand_arm
+from ccnn_torch.compensation.expansions import ChebyshevExpansion, TrigonometricExpansion, expand, expand_arm
+from ccnn_torch.compensation.kinematics import ClosedKinematics
 from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.compensation.effects.kinematic_fields import Fields, looked_at, make_fields
-from ccnn_torch.compensation.geometry.matrices import inverse
+from ccnn_torch.compensation.fields import Fields, looked_at, make_fields
+from ccnn_torch.compensation.kinematics import inverse
 from ccnn_torch.effects import Acting, Situation, labelled, make_effect
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 
