@@ -74,8 +74,9 @@ class Dictionary:
 
     Attributes:
         atoms: all candidates.
+        y: what they explain, whitened, `s x c`; rows that count.
         columns: whitened, of the library effects, name by name, and then of the discrepancy terms that are put beside
-            them, side by side, `s x c x P`; rows that count.
+            them, side by side, `s x c x P`.
         groups: which of the columns are those of an atom, for the atoms that have such.
         grams: of the columns; NaN is possible between discrepancy terms and between atoms of one name, which are in no
             set together.
@@ -86,6 +87,7 @@ class Dictionary:
     """
 
     atoms: tuple[Candidate, ...]
+    y: Tensor
     columns: Tensor
     groups: Mapping[int, Tensor]
     grams: Grams
@@ -183,6 +185,7 @@ def with_noise(dictionary: Dictionary, variance: float) -> Dictionary:
     alone, axes = _alone(products, dictionary.atoms, grams.yy, grams.values, known)
     return replace(
         dictionary,
+        y=dictionary.y / size,
         columns=dictionary.columns / size,
         grams=grams,
         axes=axes,
@@ -219,7 +222,9 @@ def dictionary_of(
     groups = {i: torch.arange(e - x[i].shape[-1], e) for i, e in zip(chosen, ends, strict=True)}
     grams = _grams(columns, y, kinds, groups, singles, firsts)
     own = {i: singles.axes[i] for i in groups}
-    return Dictionary(tuple(atoms), columns, groups, grams, own, _turned(grams, groups, own), singles.found, noise_dof)
+    return Dictionary(
+        tuple(atoms), y, columns, groups, grams, own, _turned(grams, groups, own), singles.found, noise_dof
+    )
 
 
 def _grams(
@@ -273,7 +278,7 @@ def _turned(grams: Grams, groups: Mapping[int, Tensor], axes: Mapping[int, Tenso
     return grams._replace(xx=xx, xy=xy)
 
 
-def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tensor], y: Tensor) -> list[float]:
+def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tensor]) -> list[float]:
     """Log evidence that each group of columns adds to a set.
 
     At the scales of the set, y ~ N(0, σ² K + α² Z Zᵀ) with K = I + Σ_g (α_g² / σ²) X_g X_gᵀ, so that Zᵀ K⁻¹ Z and
@@ -283,7 +288,6 @@ def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tenso
         dictionary: of the set's atoms.
         found: the set.
         groups: whitened columns, `s x c x m` each.
-        y: what they explain, whitened, `s x c`.
     """
     x = [
         dictionary.columns[..., dictionary.groups[i]] * math.exp(scale / 2) / math.sqrt(found.noise)
@@ -296,7 +300,7 @@ def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tenso
         solved: Tensor = torch.linalg.solve_triangular(factor, own.mT @ columns, upper=False)
         return solved
 
-    flat = y.reshape(-1, 1)
+    flat = dictionary.y.reshape(-1, 1)
     with_y = project(flat)
     left = []
     for group in groups:
@@ -305,5 +309,5 @@ def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tenso
         inner, along = columns.mT @ columns - with_own.mT @ with_own, columns.mT @ flat - with_own.mT @ with_y
         left.append(GroupProducts(inner, along[:, 0]))
     yy = flat.square().sum() - with_y.square().sum()
-    fits = fit_single_groups([NO_COLUMNS, *left], yy, float(y.numel()), dictionary.noise_dof)
+    fits = fit_single_groups([NO_COLUMNS, *left], yy, dictionary.grams.values, dictionary.noise_dof)
     return [float(v) for v in fits.log_evidence[1:] - fits.log_evidence[0]]

@@ -12,8 +12,8 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.residual.linearisation import signature_at
 from ccnn_torch.diagnosis.residual.rows import frame_columns
+from ccnn_torch.diagnosis.residual.whitening import without_fitted
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.search.shared_noise import without_fitted
 from ccnn_torch.effects import Situation
 from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
 

@@ -129,7 +129,7 @@ def _left(analysis: Analysis, judgement: Judgement, fold: Tensor, count: int) ->
     dictionary, white = analysis.dictionary, analysis.whitening
     keep = white.keep()
     chosen = [dictionary.groups[i] for i in judgement.found.members if not dictionary.atoms[i].is_discrepancy]
-    x, y = dictionary.columns, analysis.y
+    x, y = dictionary.columns, dictionary.y
     plain_x, plain_y = analysis.plain
     weight = white.weight[keep].sqrt()[:, None]
     used = torch.cat([torch.arange(0), *chosen])

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, LEAST_NOISE, MAD, NO_NOISE, Whitening, reweighted
+from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, MAD, NO_NOISE, Whitening, renewed
 from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.evidence.single_groups import (
     NO_COLUMNS,
@@ -49,7 +49,7 @@ def fitted_whitening(
     rms = residual[usable][:, channels].abs().median(0).values * MAD
     rms = rms.clamp_min(NO_NOISE)
     sigma = rms if noise is None else noise[channels]
-    white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0)
+    white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0 if noise is None else _KNOWN)
     shown = [c if len(channels) == c.shape[1] else c[:, channels] for c in columns if c.shape[-1]]
     shown = [c.to(residual.dtype) for c in shown]
     every = _Everything(shown, white)
@@ -58,7 +58,6 @@ def fitted_whitening(
         white = replace(white, sigma=sigma * _noise_share(every, y, white).sqrt())
     chosen: list[int] = []
     log_scale = y.new_zeros(1, 0)
-    least = None if noise is not None else (LEAST_NOISE * rms).clamp_min(NO_NOISE)
     left, free = y, 1.0
     for _ in range(_RICH):
         if chosen:
@@ -71,7 +70,7 @@ def fitted_whitening(
             free = max(
                 1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), LEAST_FREE
             )
-            white = _reestimated(white, left, usable, free, least)
+            white = renewed(white, left, y, free, usable)
         rest = [k for k in range(len(shown)) if k not in chosen]
         if not rest:
             break
@@ -85,8 +84,7 @@ def fitted_whitening(
             break
         chosen.append(likely[best])
         log_scale = torch.cat([log_scale, added.log_scale[None, best : best + 1]], -1)
-    white = _reestimated(white, left, usable, free, least)
-    return replace(white, known=0.0 if noise is None else _KNOWN)
+    return renewed(white, left, y, free, usable)
 
 
 class _Addition(NamedTuple):
@@ -182,15 +180,3 @@ def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
     best = evidence.max(0)
     left = noise.gather(0, best.indices[None])[0] / noise[0]
     return torch.where(best.values - evidence[0] > _SLIGHT, left, 1.0).clamp(1e-6, 1.0)
-
-
-def _reestimated(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:
-    """Noise (unless it is known: `least` None) and weights from what a fit leaves, `s x c`.
-
-    No channel's noise is below `least`: a perfect fit knows nothing of the noise.
-    """
-    if least is not None:
-        rows = white.weight > 0
-        spread = left[rows].abs().median(0).values * MAD / free**0.5
-        white = replace(white, sigma=torch.maximum(spread, least))
-    return reweighted(white, left, usable, free)

@@ -22,7 +22,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     Rows are dealt to the folds in runs of neighbours, at random: neighbours in time share more than others do.
     """
     keep = analysis.whitening.keep()
-    x, y = analysis.dictionary.columns, analysis.y
+    x, y = analysis.dictionary.columns, analysis.dictionary.y
     # What is left of a row is that of the row itself, whatever it shares with others.
     plain_x, plain_y = analysis.plain
     fold = folds(len(keep), seed)
