@@ -73,7 +73,7 @@ def fit_jointly(
             break
         before = rows.left, at
         fit = fit_sets(rows.grams(white), [rows.groups], 0.0)
-        at = _spread(fit, model.size)
+        at = fit.mean.new_zeros(model.size).index_copy(0, torch.cat([torch.arange(0), *rows.groups]), fit.mean[0])
         white = rows.renewed(white, fit, at)
     return JointFit(model.acting(at), model.parameters(at))
 
@@ -245,12 +245,6 @@ class _Rows:
         columns = self.columns.clone()
         columns[..., _span(model, i)] = own
         return replace(self, model=model, columns=columns)
-
-
-def _spread(fit: Fits, size: int) -> Tensor:
-    """The first set's coefficients among all, `P`; 0 where the set has none."""
-    real = fit.columns[0] >= 0
-    return fit.mean.new_zeros(size).index_copy(0, fit.columns[0][real], fit.mean[0][real])
 
 
 def _span(model: _Model, i: int) -> slice:

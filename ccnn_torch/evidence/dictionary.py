@@ -11,8 +11,15 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.marginal_likelihood import Grams, scaled
-from ccnn_torch.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups, own_products
+from ccnn_torch.evidence.marginal_likelihood import (
+    NO_COLUMNS,
+    Grams,
+    GroupProducts,
+    Prior,
+    fit_single_groups,
+    own_products,
+    scaled,
+)
 
 # Columns from which their products with all others are worth a call of their own.
 _NARROW = 128
@@ -148,7 +155,7 @@ def _alone(
     products: Mapping[int, GroupProducts], atoms: Sequence[Candidate], yy: Tensor, values: float, noise_dof: float
 ) -> tuple[dict[tuple[int, ...], FittedSet], dict[int, Tensor]]:
     """No atom, and each alone of those whose products are given; the principal axes of each."""
-    fits = fit_single_groups([NO_COLUMNS, *products.values()], yy, values, noise_dof)
+    fits, axes = fit_single_groups([NO_COLUMNS, *products.values()], yy, Prior(values, noise_dof))
     numbers = zip(
         [None, *products],
         *(v.tolist() for v in (fits.log_evidence, fits.log_scale, fits.energy, fits.rss, fits.noise, fits.effective)),
@@ -161,15 +168,15 @@ def _alone(
             members=members,
             log_posterior=evidence + sum(atoms[i].log_prior for i in members),
             log_evidence=evidence,
-            along=tuple(fits.mean[k, : len(fits.axes[k])] for _ in members),
-            axes=tuple(fits.axes[k] for _ in members),
+            along=tuple(fits.first[k, : len(axes[k])] for _ in members),
+            axes=tuple(axes[k] for _ in members),
             log_scale=(log_scale,)[: len(members)],
             energy=(energy,)[: len(members)],
             rss=rss,
             noise=noise,
             effective=effective,
         )
-    return found, dict(zip(products, fits.axes[1:], strict=True))
+    return found, dict(zip(products, axes[1:], strict=True))
 
 
 def with_noise(dictionary: Dictionary, variance: float) -> Dictionary:
@@ -309,5 +316,6 @@ def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tenso
         inner, along = columns.mT @ columns - with_own.mT @ with_own, columns.mT @ flat - with_own.mT @ with_y
         left.append(GroupProducts(inner, along[:, 0]))
     yy = flat.square().sum() - with_y.square().sum()
-    fits = fit_single_groups([NO_COLUMNS, *left], yy, dictionary.grams.values, dictionary.noise_dof)
-    return [float(v) for v in fits.log_evidence[1:] - fits.log_evidence[0]]
+    prior = Prior(dictionary.grams.values, dictionary.noise_dof)
+    evidence = fit_single_groups([NO_COLUMNS, *left], yy, prior)[0].log_evidence
+    return [float(v) for v in evidence[1:] - evidence[0]]

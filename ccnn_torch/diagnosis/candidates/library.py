@@ -16,11 +16,9 @@ from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.rows import only_usable
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
+from ccnn_torch.evidence.marginal_likelihood import GroupProducts, Prior, fit_single_groups, own_products
 from ccnn_torch.evidence.priors import EFFECT
-from ccnn_torch.evidence.single_groups import GroupProducts, fit_single_groups, own_products
 
-# Spread of the log size of an effect that is in one joint or leg alone.
-_SIZE_SPREAD = 4.0
 # What it costs to be told with secondary coefficients or without.
 _EITHER = math.log(2.0)
 
@@ -247,10 +245,8 @@ def single_joint_atoms(
         cut = [[GroupProducts(c.own.xx[p][:, p], c.own.xy[p]) for p in c.wider()] for c in going]
         counts = [len(group) for group in cut]
         squares = torch.stack([c.squares for c in going]).repeat_interleave(torch.tensor(counts))
-        values = float(len(y[0]) * len(white.channels))
-        evidence = fit_single_groups(
-            [own for group in cut for own in group], squares, values, 0.0, _SIZE_SPREAD
-        ).log_evidence
+        prior = Prior(float(len(y[0]) * len(white.channels)), 0.0)
+        evidence = fit_single_groups([own for group in cut for own in group], squares, prior)[0].log_evidence
         for choice, mine in zip(going, torch.split(evidence, counts), strict=True):
             choice.take(mine)
     return [_cut(atom, choices[k]) if k in choices else None for k, atom in enumerate(atoms)]

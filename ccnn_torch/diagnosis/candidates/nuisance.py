@@ -11,9 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, unflatten
 
-from ccnn_torch.evidence.single_groups import GroupProducts, fit_single_groups
+from ccnn_torch.evidence.marginal_likelihood import JITTER, GroupProducts, Prior, fit_single_groups
 
-_DIGITS = 1e-13
 # Relative ridge of the regression on a candidate.
 _RIDGE = 1e-6
 
@@ -120,8 +119,7 @@ class NuisanceFit:
         cross = self._taken @ flat
         gram = flat.mT @ flat
         if gram.shape[-1]:
-            # Columns that are the same, far above the noise, would leave no digit of the 1.
-            ones = 1 + _DIGITS * gram.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
+            ones = 1 + JITTER * gram.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
             gram = gram - cross.mT @ cross + torch.diag_embed(ones.expand(*gram.shape[:-1]))
         factor = torch.linalg.cholesky(gram)
         # Rows whose Gram matrix is what the nuisance takes out: (I + NᵀN)^-1/2 Nᵀ.
@@ -144,7 +142,7 @@ class NuisanceFit:
         dimensions."""
         inner, b = self._beside(tried, which)
         groups = [GroupProducts(xx, xy) for xx, xy in zip(inner, b, strict=True)]
-        return fit_single_groups(groups, self._whole @ self.y, float(len(self.y)), 0.0).log_evidence
+        return fit_single_groups(groups, self._whole @ self.y, Prior(float(len(self.y)), 0.0))[0].log_evidence
 
     def _beside(self, tried: TrialColumns, which: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Of the columns, the nuisance taken out of them, among themselves and with y: `... x g x m x m`,

@@ -10,14 +10,16 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, MAD, NO_NOISE, Whitening, renewed
-from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.evidence.single_groups import (
+from ccnn_torch.evidence.marginal_likelihood import (
     NO_COLUMNS,
     Axes,
     GroupProducts,
+    Prior,
     axes_of,
     fit_in_axes,
+    fit_sets,
     fit_single_groups,
+    grams_of,
     own_products,
 )
 
@@ -96,7 +98,7 @@ class _Addition(NamedTuple):
 
 def _additions(products: Sequence[GroupProducts], squares: Tensor, values: int) -> _Addition:
     """products: of each candidate; squares: of what it is added to, and of how many values."""
-    fits = fit_single_groups([NO_COLUMNS, *products], squares, float(values), 0.0, _ANY_SIZE)
+    fits, _ = fit_single_groups([NO_COLUMNS, *products], squares, Prior(float(values), 0.0, _ANY_SIZE))
     return _Addition(fits.log_evidence[1:] - fits.log_evidence[0], fits.log_scale[1:])
 
 
@@ -153,7 +155,7 @@ class _Everything:
         )
         square = axes.square * (share / before).mean()
         squares, there = white.scaled(left).square().sum(), torch.ones(len(square), dtype=torch.bool)
-        return fit_in_axes(square, along, there, squares, float(left.numel()), 0.0, _ANY_SIZE).log_evidence
+        return fit_in_axes(square, along, there, squares, Prior(float(left.numel()), 0.0, _ANY_SIZE)).log_evidence
 
 
 def _spread(factors: Tensor) -> float:
@@ -175,7 +177,7 @@ def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
     target = white.scaled(y).mT
     groups = [NO_COLUMNS] * len(target) + [own for each in every.by_channel(y, white) for own in each]
     squares = target.square().sum(-1).repeat(1 + len(every.columns))
-    fits = fit_single_groups(groups, squares, float(target.shape[-1]), 0.0, _ANY_SIZE)
+    fits, _ = fit_single_groups(groups, squares, Prior(float(target.shape[-1]), 0.0, _ANY_SIZE))
     evidence, noise = fits.log_evidence.reshape(-1, len(target)), fits.noise.reshape(-1, len(target))
     best = evidence.max(0)
     left = noise.gather(0, best.indices[None])[0] / noise[0]

@@ -45,7 +45,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
             fits = fit_sets(rest, [groups[i] for i in part], analysis.dictionary.noise_dof, updates, start=start)
             reached[part[0]] = fits.log_scale, fits.noise
             for row, i in enumerate(part):
-                columns = fits.columns[row][fits.columns[row] >= 0]
+                columns = torch.cat([torch.arange(0), *groups[i]])
                 m = len(columns)
                 here = plain_x[there][..., columns]
                 left[i][there] = plain_y[there] - here @ fits.mean[row, :m]
