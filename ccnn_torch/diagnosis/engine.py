@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis.checks.missing_covariates import missing_covariates
 from ccnn_torch.diagnosis.checks.order_of_rows import directions_of_order, order_shows
 from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows, plausible_rows
 from ccnn_torch.diagnosis.design.next_measurements import next_measurements
-from ccnn_torch.diagnosis.discrepancy.interaction import CROSS
+from ccnn_torch.diagnosis.discrepancy.local import CROSS
 from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes
 from ccnn_torch.diagnosis.progress import at_step

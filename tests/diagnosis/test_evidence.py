@@ -88,8 +88,8 @@ def test_what_is_put_beside_in_parts_takes_what_it_takes_at_once() -> None:
     plain, apart = (TrialColumns(torch.stack([t.one(k) for k in range(4)])) for t in (led, each))
     wanted = at_once.gain(plain)
     assert at_once.gain(each) == pytest.approx(at_once.gain(apart).numpy(), rel=1e-9)
-    # By the textbook: what M(I + MᵀM)^-1 Mᵀ leaves of y and of the columns.
-    flat, columns = x.flatten(0, 1), plain.factors.flatten(1, 2)
+    # By the textbook: what M(I + MᵀM)^-1 Mᵀ leaves of y and of the columns, M having ten plausible sizes.
+    flat, columns = 10 * x.flatten(0, 1), plain.factors.flatten(1, 2)
     leave = torch.linalg.inv(torch.eye(60, dtype=y.dtype) + flat @ flat.mT)
     along = columns.mT @ leave @ y.flatten()
     assert wanted == pytest.approx(

@@ -15,6 +15,10 @@ from ccnn_torch.evidence.marginal_likelihood import JITTER, GroupProducts, Prior
 
 # Relative ridge of the regression on a candidate.
 _RIDGE = 1e-6
+# Plausible sizes that nuisance may have: it takes what it can explain, and does not leave it to candidates.
+_WIDE = 10.0
+FINE, ROUNDS = 9, 3
+"""Values between the neighbours of the best of a grid, and how often there are such between those of the last."""
 
 
 def search_charge(gain: Tensor) -> float:
@@ -98,7 +102,7 @@ class NuisanceFit:
     """What nuisance columns with their prior leave of `y`, and of any columns put beside them."""
 
     def __init__(self, y: Tensor, nuisance: Tensor) -> None:
-        """y: `s x c`; nuisance: `s x c x P`, whitened, in units of their prior scale."""
+        """y: `s x c`; nuisance: `s x c x P`, whitened, in plausible sizes."""
         self.y = self._whole = y.reshape(-1)
         self._rows = y.shape
         self._taken = y.new_zeros(0, y.numel())
@@ -115,7 +119,7 @@ class NuisanceFit:
         return other
 
     def _take(self, more: Tensor) -> None:
-        flat = more.flatten(-3, -2)
+        flat = _WIDE * more.flatten(-3, -2)
         cross = self._taken @ flat
         gram = flat.mT @ flat
         if gram.shape[-1]:

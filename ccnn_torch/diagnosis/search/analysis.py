@@ -20,9 +20,8 @@ from ccnn_torch.diagnosis.candidates.library import (
     has_usual_shape,
     without_unused_rows,
 )
-from ccnn_torch.diagnosis.discrepancy.linear import linear_discrepancies
 from ccnn_torch.diagnosis.discrepancy.local import local_discrepancies
-from ccnn_torch.diagnosis.discrepancy.smooth import smooth_discrepancies
+from ccnn_torch.diagnosis.discrepancy.smooth import linear_discrepancies, smooth_discrepancies
 from ccnn_torch.diagnosis.progress import at_step
 from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, LOG_PRIOR, Correlation, possible_correlations
 from ccnn_torch.diagnosis.residual.linearisation import remainder, tangent
