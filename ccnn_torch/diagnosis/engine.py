@@ -12,7 +12,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.checks.cautions import cautions, of_inferred
 from ccnn_torch.diagnosis.checks.mistakes import PlausibleRows, plausible_rows
 from ccnn_torch.diagnosis.checks.unrecorded import directions_of_order, missing_covariates, order_shows
-from ccnn_torch.diagnosis.discrepancy.interaction import CROSS
+from ccnn_torch.diagnosis.discrepancy.local import CROSS
 from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes
 from ccnn_torch.diagnosis.next_measurements import next_measurements

@@ -20,7 +20,7 @@ from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
 from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
 from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
-from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, Whitening, moving_channels, renewed
+from ccnn_torch.diagnosis.residual.whitening import Whitening, moving_channels, renewed
 from ccnn_torch.effects import Acting, Effect, Situation
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.evidence.priors import EFFECT
@@ -73,7 +73,7 @@ def fit_jointly(
             break
         before = rows.left, at
         fit = fit_sets(rows.grams(white), [rows.groups], 0.0)
-        at = _spread(fit, model.size)
+        at = fit.mean.new_zeros(model.size).index_copy(0, torch.cat([torch.arange(0), *rows.groups]), fit.mean[0])
         white = rows.renewed(white, fit, at)
     return JointFit(model.acting(at), model.parameters(at))
 
@@ -233,8 +233,9 @@ class _Rows:
     def renewed(self, white: Whitening, fit: Fits, at: Tensor) -> Whitening:
         """Noise and weights from what a fit leaves."""
         values = max(float(self.fine.sum()) * len(white.channels), 1.0)
-        free = max(1 - float(fit.effective[0]) / values, LEAST_FREE)
-        return renewed(white, self.target - self.columns @ at, self.target, free, False, self.fine)
+        free = 1 - float(fit.effective[0]) / values
+        left = (self.target - self.columns @ at)[:, white.channels]
+        return renewed(white, left, self.target[:, white.channels], free, self.fine)
 
     def with_shape(self, i: int, known: Known) -> _Rows:
         """The same with another shape of one of the effects, which does nothing yet."""
@@ -244,12 +245,6 @@ class _Rows:
         columns = self.columns.clone()
         columns[..., _span(model, i)] = own
         return replace(self, model=model, columns=columns)
-
-
-def _spread(fit: Fits, size: int) -> Tensor:
-    """The first set's coefficients among all, `P`; 0 where the set has none."""
-    real = fit.columns[0] >= 0
-    return fit.mean.new_zeros(size).index_copy(0, fit.columns[0][real], fit.mean[0][real])
 
 
 def _span(model: _Model, i: int) -> slice:

@@ -11,8 +11,15 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.marginal_likelihood import Grams, scaled
-from ccnn_torch.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups, own_products
+from ccnn_torch.evidence.marginal_likelihood import (
+    NO_COLUMNS,
+    Grams,
+    GroupProducts,
+    Prior,
+    fit_single_groups,
+    own_products,
+    scaled,
+)
 
 # Columns from which their products with all others are worth a call of their own.
 _NARROW = 128
@@ -74,8 +81,9 @@ class Dictionary:
 
     Attributes:
         atoms: all candidates.
+        y: what they explain, whitened, `s x c`; rows that count.
         columns: whitened, of the library effects, name by name, and then of the discrepancy terms that are put beside
-            them, side by side, `s x c x P`; rows that count.
+            them, side by side, `s x c x P`.
         groups: which of the columns are those of an atom, for the atoms that have such.
         grams: of the columns; NaN is possible between discrepancy terms and between atoms of one name, which are in no
             set together.
@@ -86,6 +94,7 @@ class Dictionary:
     """
 
     atoms: tuple[Candidate, ...]
+    y: Tensor
     columns: Tensor
     groups: Mapping[int, Tensor]
     grams: Grams
@@ -146,7 +155,7 @@ def _alone(
     products: Mapping[int, GroupProducts], atoms: Sequence[Candidate], yy: Tensor, values: float, noise_dof: float
 ) -> tuple[dict[tuple[int, ...], FittedSet], dict[int, Tensor]]:
     """No atom, and each alone of those whose products are given; the principal axes of each."""
-    fits = fit_single_groups([NO_COLUMNS, *products.values()], yy, values, noise_dof)
+    fits, axes = fit_single_groups([NO_COLUMNS, *products.values()], yy, Prior(values, noise_dof))
     numbers = zip(
         [None, *products],
         *(v.tolist() for v in (fits.log_evidence, fits.log_scale, fits.energy, fits.rss, fits.noise, fits.effective)),
@@ -159,15 +168,15 @@ def _alone(
             members=members,
             log_posterior=evidence + sum(atoms[i].log_prior for i in members),
             log_evidence=evidence,
-            along=tuple(fits.mean[k, : len(fits.axes[k])] for _ in members),
-            axes=tuple(fits.axes[k] for _ in members),
+            along=tuple(fits.first[k, : len(axes[k])] for _ in members),
+            axes=tuple(axes[k] for _ in members),
             log_scale=(log_scale,)[: len(members)],
             energy=(energy,)[: len(members)],
             rss=rss,
             noise=noise,
             effective=effective,
         )
-    return found, dict(zip(products, fits.axes[1:], strict=True))
+    return found, dict(zip(products, axes[1:], strict=True))
 
 
 def with_noise(dictionary: Dictionary, variance: float) -> Dictionary:
@@ -183,6 +192,7 @@ def with_noise(dictionary: Dictionary, variance: float) -> Dictionary:
     alone, axes = _alone(products, dictionary.atoms, grams.yy, grams.values, known)
     return replace(
         dictionary,
+        y=dictionary.y / size,
         columns=dictionary.columns / size,
         grams=grams,
         axes=axes,
@@ -219,7 +229,9 @@ def dictionary_of(
     groups = {i: torch.arange(e - x[i].shape[-1], e) for i, e in zip(chosen, ends, strict=True)}
     grams = _grams(columns, y, kinds, groups, singles, firsts)
     own = {i: singles.axes[i] for i in groups}
-    return Dictionary(tuple(atoms), columns, groups, grams, own, _turned(grams, groups, own), singles.found, noise_dof)
+    return Dictionary(
+        tuple(atoms), y, columns, groups, grams, own, _turned(grams, groups, own), singles.found, noise_dof
+    )
 
 
 def _grams(
@@ -273,7 +285,7 @@ def _turned(grams: Grams, groups: Mapping[int, Tensor], axes: Mapping[int, Tenso
     return grams._replace(xx=xx, xy=xy)
 
 
-def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tensor], y: Tensor) -> list[float]:
+def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tensor]) -> list[float]:
     """Log evidence that each group of columns adds to a set.
 
     At the scales of the set, y ~ N(0, σ² K + α² Z Zᵀ) with K = I + Σ_g (α_g² / σ²) X_g X_gᵀ, so that Zᵀ K⁻¹ Z and
@@ -283,7 +295,6 @@ def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tenso
         dictionary: of the set's atoms.
         found: the set.
         groups: whitened columns, `s x c x m` each.
-        y: what they explain, whitened, `s x c`.
     """
     x = [
         dictionary.columns[..., dictionary.groups[i]] * math.exp(scale / 2) / math.sqrt(found.noise)
@@ -296,7 +307,7 @@ def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tenso
         solved: Tensor = torch.linalg.solve_triangular(factor, own.mT @ columns, upper=False)
         return solved
 
-    flat = y.reshape(-1, 1)
+    flat = dictionary.y.reshape(-1, 1)
     with_y = project(flat)
     left = []
     for group in groups:
@@ -305,5 +316,6 @@ def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tenso
         inner, along = columns.mT @ columns - with_own.mT @ with_own, columns.mT @ flat - with_own.mT @ with_y
         left.append(GroupProducts(inner, along[:, 0]))
     yy = flat.square().sum() - with_y.square().sum()
-    fits = fit_single_groups([NO_COLUMNS, *left], yy, float(y.numel()), dictionary.noise_dof)
-    return [float(v) for v in fits.log_evidence[1:] - fits.log_evidence[0]]
+    prior = Prior(dictionary.grams.values, dictionary.noise_dof)
+    evidence = fit_single_groups([NO_COLUMNS, *left], yy, prior)[0].log_evidence
+    return [float(v) for v in evidence[1:] - evidence[0]]

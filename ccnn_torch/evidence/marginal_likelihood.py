@@ -3,6 +3,10 @@
 Of a set of groups: y ~ N(X θ, σ² I), θ of group g ~ N(0, α_g² I), log α_g² ~ N(0, s²), and log σ² flat, or about 0
 where the noise was given. α and σ are brought to their most probable values by MacKay's updates (1992) and integrated
 there.
+
+There is one such fit. Where the groups are in their principal axes, a group's inner products with itself are a
+diagonal: it is eliminated by dividing, and only a matrix of the other columns is factorised (Schur's complement). So
+groups that are alone need no matrix at all, and of a set its widest group is left out of it.
 """
 
 from __future__ import annotations
@@ -18,12 +22,16 @@ from torch import Tensor
 _NARROW = 128
 # MacKay updates.
 _UPDATES = 8
-_DIGITS = 1e-13
+JITTER = 1e-13
+"""Added to the diagonal of a Gram matrix with 1 on it, as a share of the largest element: columns that are nearly the
+same, far above the noise, would leave no digit of the 1."""
+# Principal axes with less than this share of the largest one's squares are rounding.
+_DIGITS = 1e-14
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
-SPREAD = 4.0
-LIMIT = 25.0
-FIRST_NOISE = 10.0
-"""Updates begin with the mean square over this as variance of the noise."""
+_SPREAD = 4.0
+_LIMIT = 25.0
+# Updates begin with the mean square over this as variance of the noise.
+_FIRST_NOISE = 10.0
 # No update changes log α² by more.
 _LARGEST_STEP = 3.0
 _TINY = 1e-12
@@ -46,26 +54,30 @@ class Fits(NamedTuple):
     Attributes:
         log_evidence: `b`.
         noise: σ² in the units of y, `b`.
-        columns: index of each column, `b x M`; -1 = padding.
-        slot: which group of its set a column belongs to, `b x M`.
-        mean: posterior mean of the coefficients, `b x M`.
-        covariance: posterior covariance of the coefficients, `b x M x M`.
+        first: posterior means of the coefficients of a first group in its principal axes, `b x m`.
+        mean: of all others, `b x M`.
         energy: Σ (X_g θ_g)² of each group alone, `b x g`.
         rss: remaining sum of squares, `b`.
         effective: number of coefficients that the data determine, `b`.
         log_scale: log α², `b x g`.
+        scale, inverse: α of each of the others, `b x M`, and the inverse of their products in units of α and σ.
     """
 
     log_evidence: Tensor
     noise: Tensor
-    columns: Tensor
-    slot: Tensor
+    first: Tensor
     mean: Tensor
-    covariance: Tensor
     energy: Tensor
     rss: Tensor
     effective: Tensor
     log_scale: Tensor
+    scale: Tensor
+    inverse: Tensor
+
+    @property
+    def covariance(self) -> Tensor:
+        """Posterior covariance of the coefficients, `b x M x M`; of sets without a first group."""
+        return self.scale[:, :, None] * self.inverse * self.scale[:, None, :]
 
 
 def grams_of(x: Tensor, y: Tensor) -> Grams:
@@ -99,12 +111,26 @@ def without(grams: Grams, x: Tensor, y: Tensor, columns: Tensor) -> Grams:
     return Grams(xx, xy, grams.yy - away.yy, grams.values - away.values)
 
 
+class Prior(NamedTuple):
+    """What is known beforehand of scales and noise.
+
+    Attributes:
+        values: how many values are explained.
+        noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
+        spread: standard deviation of log α².
+    """
+
+    values: float
+    noise_dof: float
+    spread: float = _SPREAD
+
+
 def fit_sets(
     grams: Grams,
     sets: Sequence[Sequence[Tensor]],
     noise_dof: float,
     iterations: int = _UPDATES,
-    spread: float = SPREAD,
+    spread: float = _SPREAD,
     start: tuple[Tensor, Tensor] | None = None,
 ) -> Fits:
     """Fit every set of groups.
@@ -117,113 +143,267 @@ def fit_sets(
         spread: standard deviation of log α².
         start: log α² of each group, `b x g`, and σ², `b`, to begin with.
     """
-    columns, slot = padded(sets)
-    columns, slot = columns.to(grams.xy.device), slot.to(grams.xy.device)
     groups = max(max(map(len, sets), default=0), 1)
-    safe = columns.clamp_min(0)
+    width = torch.tensor([[*map(len, s), *[0] * (groups - len(s))] for s in sets], dtype=torch.int64)
+    width = width.reshape(len(sets), groups)
+    # Where each group stands among all of them, one after the other.
+    index, slot = column_indices(width.flatten().cumsum(0).reshape(width.shape) - width, width)
+    safe, real = torch.cat([index.new_zeros(1), *(g for s in sets for g in s)])[index + 1], index >= 0
     # Products with columns that are not there are NaN, and no factor 0 makes a number of that.
-    real = columns >= 0
-    g = torch.where(real[:, :, None] & real[:, None, :], grams.xx[safe[:, :, None], safe[:, None, :]], 0.0)
-    b = torch.where(real, grams.xy[safe], 0.0)
-    member = torch.nn.functional.one_hot(slot.clamp_min(0), groups).to(g.dtype) * real[..., None]  # b x M x groups
-    there = member.sum(1) > 0
-    scales = Scales(grams.values, noise_dof, there, spread)
-    # Start where the prior of each group could make the whole gap, and the noise is a tenth of it.
-    trace = (member * g.diagonal(dim1=-2, dim2=-1)[..., None]).sum(1).clamp_min(1e-300)
-    psi = torch.log((grams.yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
-    noise = (grams.yy / grams.values / FIRST_NOISE).clamp_min(1e-12).expand(len(columns)).clone()
-    noise = torch.where(torch.tensor(noise_dof > 0), torch.ones_like(noise), noise)
+    own = torch.where(real[:, :, None] & real[:, None, :], grams.xx[safe[:, :, None], safe[:, None, :]], 0.0)
+    along = torch.where(real, grams.xy[safe], 0.0)
+    none = along[:, :0]
+    parts = _Parts(none, none, own[:, :0], own, along, _members(slot, groups, own))
+    there = torch.nn.functional.pad(width > 0, (1, 0))
     if start is not None:
-        psi, noise = start
-    width = columns.shape[1]
-    for k in range(iterations + 1):
-        scale = (member @ (psi / 2).exp()[..., None])[..., 0]
-        whole = scale / noise.sqrt()[:, None]
-        a = (g * whole[:, :, None]).mul_(whole[:, None, :])
-        if width:
-            # Columns that are nearly the same, under next to no noise, would leave no digit of the 1 on the diagonal.
-            diagonal = a.diagonal(dim1=-2, dim2=-1)
-            diagonal += (1 + _DIGITS * diagonal.amax(-1))[:, None]
-        factor = torch.linalg.cholesky_ex(a).L
-        c = scale * b / noise[:, None]
-        u = torch.cholesky_solve(c[..., None], factor)[..., 0]
-        inverse = torch.cholesky_inverse(factor) if width else a
-        gamma = ((1 - inverse.diagonal(dim1=-2, dim2=-1))[..., None] * member).sum(1)
-        size = (u.square()[..., None] * member).sum(1)
-        mean = scale * u
-        rss = (grams.yy - 2 * (mean * b).sum(-1) + ((g @ mean[..., None])[..., 0] * mean).sum(-1)).clamp_min(0)
-        if k == iterations:
-            break
-        psi, noise = scales.updated(psi, size, gamma, rss)
-    log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    squares = grams.yy / noise - (c * u).sum(-1)
-    log_evidence = scales.log_evidence(psi, gamma, noise, squares, log_det)
-    part = mean[..., None] * member
-    energy = (part * (g @ part)).sum(1)
-    covariance = scale[:, :, None] * inverse * scale[:, None, :]
-    return Fits(log_evidence, noise, columns, slot, mean, covariance, energy, rss, gamma.sum(-1), psi)
+        start = torch.nn.functional.pad(start[0], (1, 0)), start[1]
+    fits = _most_probable(parts, there, grams.yy, Prior(grams.values, noise_dof, spread), iterations, start)
+    return fits._replace(energy=fits.energy[:, 1:], log_scale=fits.log_scale[:, 1:])
 
 
-def padded(sets: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
-    """Columns and slots of every set, `b x M`, padded with -1."""
-    widths = [[g.numel() for g in s] for s in sets]
-    totals = torch.tensor([sum(w) for w in widths], dtype=torch.int64)
-    shape = (len(sets), int(totals.max()) if len(sets) else 0)
-    columns, slot = torch.full(shape, -1), torch.full(shape, -1)
-    flat = [g for s in sets for g in s]
-    if flat:
-        row = torch.repeat_interleave(torch.arange(len(sets)), totals)
-        place = torch.arange(len(row)) - (totals.cumsum(0) - totals)[row]
-        number = torch.tensor([k for w in widths for k in range(len(w))])
-        columns[row, place] = torch.cat(flat)
-        slot[row, place] = torch.repeat_interleave(number, torch.tensor([n for w in widths for n in w]))
-    return columns, slot
+def fit_batched_sets(
+    turned: Grams, begin: Tensor, width: Tensor, noise_dof: float, start: tuple[Tensor, Tensor], updates: int
+) -> Fits:
+    """As `fit_sets`, of groups in their principal axes.
+
+    Args:
+        turned: inner products of all columns, each group in its principal axes, and of a last column of zeros.
+        begin, width: first column of each group of a set and how many it has, the widest group first, `b x g`, g > 1.
+        noise_dof: as for `fit_sets`.
+        start: log α² of each group, `b x g`, and σ², `b`.
+        updates: MacKay's.
+    """
+    index, _ = column_indices(begin[:, :1], width[:, :1])
+    others, slot = column_indices(begin[:, 1:], width[:, 1:])
+    # -1, no column, is the last one.
+    own = turned.xx[others[:, :, None], others[:, None, :]]
+    parts = _Parts(
+        turned.xx.diagonal()[index],
+        turned.xy[index],
+        turned.xx[index[:, :, None], others[:, None, :]],
+        own,
+        turned.xy[others],
+        _members(slot, width.shape[1] - 1, own),
+    )
+    return _most_probable(parts, width > 0, turned.yy, Prior(turned.values, noise_dof), updates, start)
 
 
-class Scales(NamedTuple):
-    """What is known beforehand of the scales of `b` sets of `g` groups.
+def fit_in_axes(square: Tensor, along: Tensor, there: Tensor, yy: Tensor, prior: Prior) -> Fits:
+    """As `fit_sets`, of groups that are alone in their principal axes.
+
+    Args:
+        square, along: inner products along each group's principal axes with themselves and with y, `b x m`, padded
+            with 0.
+        there: False for a group of no columns, `b`.
+        yy: sum of the squares to be explained, 0-dim, or of each group, `b`.
+        prior: of all.
+
+    Returns:
+        `energy` and `log_scale` of `b`.
+    """
+    none = square[..., None][..., :0]
+    parts = _Parts(square, along, none, none[:, :0], square[:, :0], none[:, :0])
+    fits = _most_probable(parts, there[:, None], yy, prior, _UPDATES)
+    return fits._replace(energy=fits.energy[:, 0], log_scale=fits.log_scale[:, 0])
+
+
+def column_indices(begin: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns of `b` sets of `g` runs, which begin at some column and are so wide, `b x g` each.
+
+    Returns:
+        the columns of each set, `b x M`, and which of its runs they belong to; -1 where there are no more.
+    """
+    ends = width.cumsum(-1)
+    place = torch.arange(int(ends[:, -1].max()) if len(ends) else 0)
+    slot = (place[:, None] >= ends[:, None, :]).sum(-1)
+    there = slot < width.shape[1]
+    own = slot.clamp_max(width.shape[1] - 1)
+    columns = place + (begin - ends + width).gather(1, own)
+    return torch.where(there, columns, -1), torch.where(there, slot, -1)
+
+
+def _members(slot: Tensor, groups: int, like: Tensor) -> Tensor:
+    """1 where a column is of a group, else 0, `b x M x groups`."""
+    return (slot[..., None] == torch.arange(groups)).to(like.dtype)
+
+
+class _Parts(NamedTuple):
+    """Inner products of `b` sets: a first group in its principal axes, `m` columns, and other columns, `M`.
 
     Attributes:
-        values: how many values are explained.
-        noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
-        there: which groups there are, `b x g`, bool.
-        spread: standard deviation of log α².
+        square, along: of the first group's columns with themselves and with y, `b x m`.
+        across: of these with the others, `b x m x M`.
+        own, along_rest: of the others with each other, `b x M x M`, and with y, `b x M`.
+        member: 1 where a column of the others is of one of their groups, else 0, `b x M x (g - 1)`.
     """
 
-    values: float
-    noise_dof: float
-    there: Tensor
-    spread: float = SPREAD
+    square: Tensor
+    along: Tensor
+    across: Tensor
+    own: Tensor
+    along_rest: Tensor
+    member: Tensor
 
-    def updated(self, psi: Tensor, size: Tensor, gamma: Tensor, rss: Tensor) -> tuple[Tensor, Tensor]:
-        """The next log α² `b x g` and σ² `b`.
+    def by_group(self, first: Tensor, rest: Tensor) -> Tensor:
+        """Sums over each group's columns, `b x g`; first: that of the first group, `b`; rest: `b x M`."""
+        return torch.cat([first[:, None], (rest[:, None] @ self.member)[:, 0]], -1)
 
-        MacKay's update, which takes coefficients and γ for fixed, and one of Newton's steps from there for the prior.
 
-        Args:
-            psi: log α², `b x g`.
-            size: sum of the squares of each group's coefficients in units of α, `b x g`.
-            gamma: number of coefficients of each group that the data determine, `b x g`.
-            rss: remaining sum of squares, `b`.
-        """
-        prior = 1 / self.spread**2
-        step = torch.log(size.clamp_min(_TINY) / gamma.clamp_min(_TINY)).clamp(-_LARGEST_STEP, _LARGEST_STEP)
-        half = 0.5 * size * torch.exp(-step)
-        step = step + (half - 0.5 * gamma - (psi + step) * prior) / (half + prior)
-        psi = (psi + step.clamp_(-_LARGEST_STEP, _LARGEST_STEP).mul_(self.there)).clamp_(-LIMIT, LIMIT)
-        left = (self.values - gamma.sum(-1)).clamp_min(_FREE * self.values + 1)
-        return psi, ((rss + self.noise_dof) / (left + self.noise_dof)).clamp_min(1e-12)
+def _most_probable(
+    parts: _Parts, there: Tensor, yy: Tensor, prior: Prior, updates: int, start: tuple[Tensor, Tensor] | None = None
+) -> Fits:
+    """Sets at their most probable scales.
 
-    def log_evidence(self, psi: Tensor, gamma: Tensor, noise: Tensor, squares: Tensor, log_det: Tensor) -> Tensor:
-        """At log α² `b x g` and σ² `b`, `b`.
+    Args:
+        parts: inner products.
+        there: which groups there are, `b x g`, bool.
+        yy: sum of the squares to be explained, 0-dim or `b`.
+        prior: of scales and noise.
+        updates: MacKay's.
+        start: log α² of each group, `b x g`, and σ², `b`, to begin with. None = where the prior of each group could
+            make the whole gap, and the noise is a tenth of it.
+    """
+    square, along_first, across, own, along_rest, member = parts
+    edge = own.diagonal(dim1=-2, dim2=-1)
+    yy = yy.expand(len(square))
+    if start is None:
+        trace = parts.by_group(square.sum(-1), edge).clamp_min(1e-300)
+        psi = torch.log((yy[:, None].clamp_min(1e-300) / trace).clamp(math.exp(-_LIMIT), math.exp(_LIMIT))) * there
+        noise = torch.ones_like(yy) if prior.noise_dof > 0 else (yy / prior.values / _FIRST_NOISE).clamp_min(1e-12)
+        start = psi, noise
+    psi, noise = start
+    for k in range(updates + 1):
+        half, sigma = (psi / 2).exp(), noise.sqrt()[:, None]
+        scale_first, scale_rest = half[:, :1], (member @ half[:, 1:, None])[..., 0]
+        first_in, rest_in = scale_first / sigma, scale_rest / sigma
+        diagonal = 1 + square * first_in.square()
+        # The first group's columns, weighted as they take part in what is left of the others.
+        weighted = across * (first_in.square() / diagonal)[..., None]
+        both = rest_in[:, :, None] * rest_in[:, None, :]
+        inner = (own - across.mT @ weighted).mul_(both)
+        largest = torch.nn.functional.pad(edge * rest_in.square(), (0, 1)).amax(-1, keepdim=True)
+        inner.diagonal(dim1=-2, dim2=-1).add_(1 + JITTER * largest)
+        factor = torch.linalg.cholesky_ex(inner).L
+        inverse = torch.cholesky_inverse(factor)
+        c_first, c_rest = scale_first * along_first / noise[:, None], scale_rest * along_rest / noise[:, None]
+        taken = (across.mT @ (first_in / diagonal * c_first)[..., None])[..., 0]
+        u_rest = (inverse @ (c_rest - rest_in * taken)[..., None])[..., 0]
+        mean = scale_rest * u_rest
+        reached = (across @ mean[..., None])[..., 0]
+        u_first = (c_first - first_in / sigma * reached) / diagonal
+        first = scale_first * u_first
+        spread = (across.mT @ weighted.div_(diagonal[..., None])).mul_(both).mul_(inverse).sum((-2, -1))
+        gamma = parts.by_group((1 - 1 / diagonal).sum(-1) - spread, 1 - inverse.diagonal(dim1=-2, dim2=-1))
+        explained = (first * along_first).sum(-1) + (mean * along_rest).sum(-1)
+        made = (first * (square * first + 2 * reached)).sum(-1) + ((own @ mean[..., None])[..., 0] * mean).sum(-1)
+        rss = (yy - 2 * explained + made).clamp_min(0)
+        if k == updates:
+            break
+        size = parts.by_group(u_first.square().sum(-1), u_rest.square())
+        psi, noise = _updated(psi, size, gamma, rss, there, prior)
+    log_det = diagonal.log().sum(-1) + 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    plain = -0.5 * (prior.values * noise.log() + (yy - explained) / noise + log_det)
+    plain = plain - 0.5 * prior.noise_dof * (noise.log() + 1 / noise - 1)
+    hyper = -0.5 * psi.square() / prior.spread**2 - 0.5 * torch.log1p(0.5 * gamma * prior.spread**2)
+    evidence = plain + (hyper * there).sum(-1)
+    pieces = mean[..., None] * member
+    energy = torch.cat([(square * first.square()).sum(-1, keepdim=True), (pieces * (own @ pieces)).sum(1)], -1)
+    return Fits(evidence, noise, first, mean, energy, rss, gamma.sum(-1), psi, scale_rest, inverse)
 
-        Args:
-            psi, gamma: as for `updated`.
-            noise: σ², `b`.
-            squares: of y in units of its covariance, `b`.
-            log_det: of that covariance in units of σ², `b`.
-        """
-        plain = -0.5 * (self.values * noise.log() + squares + log_det)
-        plain = plain - 0.5 * self.noise_dof * (noise.log() + 1 / noise - 1)
-        hyper = -0.5 * psi.square() / self.spread**2 - 0.5 * torch.log1p(0.5 * gamma * self.spread**2)
-        return plain + (hyper * self.there).sum(-1)
+
+def _updated(
+    psi: Tensor, size: Tensor, gamma: Tensor, rss: Tensor, there: Tensor, prior: Prior
+) -> tuple[Tensor, Tensor]:
+    """The next log α² `b x g` and σ² `b`.
+
+    MacKay's update, which takes coefficients and γ for fixed, and one of Newton's steps from there for the prior.
+
+    Args:
+        psi: log α², `b x g`.
+        size: sum of the squares of each group's coefficients in units of α, `b x g`.
+        gamma: number of coefficients of each group that the data determine, `b x g`.
+        rss: remaining sum of squares, `b`.
+        there: which groups there are, `b x g`, bool.
+        prior: of scales and noise.
+    """
+    precision = 1 / prior.spread**2
+    step = torch.log(size.clamp_min(_TINY) / gamma.clamp_min(_TINY)).clamp(-_LARGEST_STEP, _LARGEST_STEP)
+    half = 0.5 * size * torch.exp(-step)
+    step = step + (half - 0.5 * gamma - (psi + step) * precision) / (half + precision)
+    psi = (psi + step.clamp_(-_LARGEST_STEP, _LARGEST_STEP).mul_(there)).clamp_(-_LIMIT, _LIMIT)
+    left = (prior.values - gamma.sum(-1)).clamp_min(_FREE * prior.values + 1)
+    return psi, ((rss + prior.noise_dof) / (left + prior.noise_dof)).clamp_min(1e-12)
+
+
+class GroupProducts(NamedTuple):
+    """Inner products of one group of columns: `xx` `m x m` with itself, `xy` `m` with what is to be explained."""
+
+    xx: Tensor
+    xy: Tensor
+
+
+NO_COLUMNS = GroupProducts(torch.zeros(0, 0), torch.zeros(0))
+"""A group of no columns."""
+
+
+def own_products(x: Tensor, y: Tensor, size: Tensor | float = 1.0) -> GroupProducts:
+    """x: whitened columns, `... x m`, which count divided by `size`; y: what they explain, `...`."""
+    flat = x.flatten(0, -2)
+    return GroupProducts(flat.mT @ flat / size**2, flat.mT @ y.reshape(-1) / size)
+
+
+def fit_single_groups(groups: Sequence[GroupProducts], yy: Tensor, prior: Prior) -> tuple[Fits, list[Tensor]]:
+    """Fit every group separately; `NO_COLUMNS` is what there is without any.
+
+    Args:
+        groups: inner products of each.
+        yy, prior: as for `fit_in_axes`.
+
+    Returns:
+        as of `fit_in_axes`; and the principal axes of each, `m x m`.
+    """
+    axes = axes_of([g.xx for g in groups], yy)
+    along = axes.turned([g.xy for g in groups])
+    there = torch.tensor([g.xy.numel() > 0 for g in groups])
+    return fit_in_axes(axes.square, along, there, yy, prior), axes.each()
+
+
+class Axes(NamedTuple):
+    """Principal axes of `b` groups of columns.
+
+    Attributes:
+        square: squares of the columns along them, `b x M`, 0 where that is rounding or there are no more.
+        alike: which groups are as wide as each other, and their axes, `k x m x m`.
+    """
+
+    square: Tensor
+    alike: Sequence[tuple[list[int], Tensor]]
+
+    def turned(self, products: Sequence[Tensor]) -> Tensor:
+        """Products of the columns with something, `m` each, along the axes, `b x M`, padded with 0."""
+        along = torch.zeros_like(self.square)
+        for mine, vectors in self.alike:
+            width = vectors.shape[-1]
+            along[mine, :width] = (vectors.mT @ torch.stack([products[k] for k in mine])[..., None])[..., 0]
+        return torch.where(self.square > 0, along, 0.0)
+
+    def each(self) -> list[Tensor]:
+        """The axes of every group, `m x m`."""
+        axes = [self.square.new_zeros(0, 0) for _ in self.square]
+        for mine, vectors in self.alike:
+            for k, v in zip(mine, vectors, strict=True):
+                axes[k] = v
+        return axes
+
+
+def axes_of(products: Sequence[Tensor], like: Tensor) -> Axes:
+    """products: of each group's columns with each other, `m x m`; like: numbers of the type that is wanted."""
+    widths = [len(xx) for xx in products]
+    square = like.new_zeros(len(products), max(widths, default=0))
+    alike = []
+    for width in sorted(set(widths) - {0}):
+        mine = [k for k, w in enumerate(widths) if w == width]
+        values, vectors = torch.linalg.eigh(torch.stack([products[k] for k in mine]))
+        square[mine, :width] = torch.where(values > _DIGITS * values[:, -1:], values, 0.0)
+        alike.append((mine, vectors))
+    return Axes(square, alike)

@@ -9,10 +9,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.batched_sets import BatchedFits, column_indices, fit_batched_sets
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.evidence.marginal_likelihood import (
+    JITTER,
+    Fits,
+    Prior,
+    column_indices,
+    fit_batched_sets,
+    fit_in_axes,
+)
 from ccnn_torch.evidence.priors import crowd
-from ccnn_torch.evidence.single_groups import fit_in_axes
 
 # Updates of a fit; after the short one no set that came within 12 of the best in the end was 30 below it, in trials.
 _UPDATES, _SHORT, _HOPELESS = 4, 1, 40.0
@@ -23,7 +29,6 @@ _LESS_NOISE = 0.1
 _RIVAL, _THERE = 30.0, 10.0
 # Sets of about the same widths are fitted side by side, as many as have their products near the processor.
 _NEAR = 50_000
-_DIGITS = 1e-13
 # Sets are evaluated in one batch where their widths differ by less than this.
 _ALIKE = 24
 # Beside a set that so many atoms are added to, all columns are evaluated once.
@@ -140,7 +145,7 @@ def _lots(dictionary: Dictionary, members: Tensor) -> Iterator[Tensor]:
     yield order[begin:]
 
 
-def _updated(dictionary: Dictionary, begun: _Begun, updates: int) -> BatchedFits:
+def _updated(dictionary: Dictionary, begun: _Begun, updates: int) -> Fits:
     begin, width = dictionary.begins[begun.members], dictionary.widths[begun.members]
     start = begun.log_scale, begun.noise
     return fit_batched_sets(dictionary.turned, begin, width, dictionary.noise_dof, start, updates)
@@ -188,7 +193,7 @@ def _log_prior(dictionary: Dictionary, members: Tensor) -> Tensor:
 
 
 def _read(
-    dictionary: Dictionary, sets: Sequence[tuple[int, ...]], members: Tensor, fits: BatchedFits
+    dictionary: Dictionary, sets: Sequence[tuple[int, ...]], members: Tensor, fits: Fits
 ) -> dict[tuple[int, ...], FittedSet]:
     """members: of the sets, the widest first, `b x g`."""
     found = {}
@@ -205,7 +210,7 @@ def _read(
         log_scale,
         (log_posterior, log_evidence, rss, noise, effective),
     ) in enumerate(rows):
-        along = fits.first[row, : widths[0]], *torch.split(fits.rest[row, : sum(widths[1:])], widths[1:])
+        along = fits.first[row, : widths[0]], *torch.split(fits.mean[row, : sum(widths[1:])], widths[1:])
         place = [ordered.index(i) for i in own]
         found[own] = FittedSet(
             members=own,
@@ -242,8 +247,8 @@ def added_scale(dictionary: Dictionary, before: Sequence[FittedSet], more: Seque
         else:
             place = torch.tensor(each)[:, None], own[rows]
             square[rows], along[rows], yy[rows] = squares[place], products[place], left[place[0][:, 0]]
-    fits = fit_in_axes(square.clamp_min(0), along, own[:, 0] >= 0, yy.clamp_min(0), turned.values, dictionary.noise_dof)
-    return fits.log_scale
+    prior = Prior(turned.values, dictionary.noise_dof)
+    return fit_in_axes(square.clamp_min(0), along, dictionary.widths[atoms[:, 0]] > 0, yy.clamp_min(0), prior).log_scale
 
 
 def _batches(
@@ -295,7 +300,7 @@ def _left_of_columns(
     size = ((scales.gather(1, slot.clamp_min(0)) - noise.log()[:, None]) / 2).exp()
     kernel = (size[:, :, None] * turned.xx[columns[:, :, None], columns[:, None, :]]).mul_(size[:, None, :])
     edge = kernel.diagonal(dim1=-2, dim2=-1)
-    edge += 1 + _DIGITS * edge.amax(-1, keepdim=True)
+    edge += 1 + JITTER * edge.amax(-1, keepdim=True)
     factor = torch.linalg.cholesky_ex(kernel).L
     right = turned.xx[columns] if wanted is None else turned.xx[columns[:, :, None], wanted[:, None, :]]
     taken = torch.linalg.solve_triangular(factor, right.mul_(size[..., None]), upper=False)

@@ -106,7 +106,7 @@ def test_a_fit_is_settled_where_noise_and_machine_are_as_the_linear_model_says()
     left = linear * old.sigma
 
     def fits(new: Whitening = old, left: Tensor = left) -> bool:
-        return is_converged(dictionary, y, best, old, new, left)
+        return is_converged(dictionary, best, old, new, left)
 
     assert fits() and fits(replace(old, sigma=3 * old.sigma))
     assert not fits(replace(old, sigma=old.sigma * torch.tensor([1.0, 2.0]))), "one channel is noisier than thought"

@@ -13,11 +13,17 @@ from scipy.stats import multivariate_normal
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns
 from ccnn_torch.effects import make_effect
-from ccnn_torch.evidence.batched_sets import column_indices
 from ccnn_torch.evidence.dictionary import Dictionary, dictionary_of, singles_of
-from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.evidence.marginal_likelihood import (
+    NO_COLUMNS,
+    Prior,
+    column_indices,
+    fit_sets,
+    fit_single_groups,
+    grams_of,
+    own_products,
+)
 from ccnn_torch.evidence.sets import promising, scored
-from ccnn_torch.evidence.single_groups import NO_COLUMNS, fit_single_groups, own_products
 
 
 def _columns(seed: int, rows: int, width: int) -> torch.Tensor:
@@ -82,8 +88,8 @@ def test_what_is_put_beside_in_parts_takes_what_it_takes_at_once() -> None:
     plain, apart = (TrialColumns(torch.stack([t.one(k) for k in range(4)])) for t in (led, each))
     wanted = at_once.gain(plain)
     assert at_once.gain(each) == pytest.approx(at_once.gain(apart).numpy(), rel=1e-9)
-    # By the textbook: what M(I + MᵀM)^-1 Mᵀ leaves of y and of the columns.
-    flat, columns = x.flatten(0, 1), plain.factors.flatten(1, 2)
+    # By the textbook: what M(I + MᵀM)^-1 Mᵀ leaves of y and of the columns, M having ten plausible sizes.
+    flat, columns = 10 * x.flatten(0, 1), plain.factors.flatten(1, 2)
     leave = torch.linalg.inv(torch.eye(60, dtype=y.dtype) + flat @ flat.mT)
     along = columns.mT @ leave @ y.flatten()
     assert wanted == pytest.approx(
@@ -117,11 +123,13 @@ def test_groups_in_their_axes_are_as_sets_of_one() -> None:
     x, y = _columns(10, 40, 9), _columns(11, 40, 1)[..., 0]
     x[..., 8] = x[..., 7]
     groups = [torch.arange(0, 3), torch.arange(3, 7), torch.arange(7, 9)]
-    found = fit_single_groups([NO_COLUMNS, *(own_products(x[..., g], y) for g in groups)], y.square().sum(), 40.0, 5.0)
+    products = [NO_COLUMNS, *(own_products(x[..., g], y) for g in groups)]
+    found, axes = fit_single_groups(products, y.square().sum(), Prior(40.0, 5.0))
     for k, group in enumerate([[], *([g] for g in groups)]):
         one = fit_sets(grams_of(x, y), [group], 5.0)
         assert float(found.log_evidence[k]) == pytest.approx(float(one.log_evidence[0]), rel=1e-9)
-        assert found.coefficients()[k] == pytest.approx(one.mean[0].numpy(), rel=1e-6)
+        coefficients = axes[k] @ found.first[k, : len(axes[k])]
+        assert coefficients == pytest.approx(one.mean[0].numpy(), rel=1e-6)
         for name in ("noise", "rss", "effective"):
             assert float(getattr(found, name)[k]) == pytest.approx(float(getattr(one, name)[0]), rel=1e-9)
 

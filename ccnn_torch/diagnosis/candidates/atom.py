@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.effects import EXACT, Coefficient, Effect, Situation, signature
 from ccnn_torch.evidence.form_error import OF_EXACT, OF_FORM, OF_SMOOTH
+from ccnn_torch.evidence.priors import OUTSIDE
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,13 @@ class Atom:
     def form_error(self) -> float:
         """Share of its squares by which its form may be wrong in every direction."""
         return OF_SMOOTH if self.effect is None else OF_EXACT if self.name in EXACT else OF_FORM
+
+
+def discrepancy(
+    driver: str, columns: Tensor, log_odds: float = 0.0, plain: bool = False, note: str = "", begins: int | None = None
+) -> Atom:
+    """A discrepancy term; log_odds: of it beside the usual one; the others as in `Atom`."""
+    return Atom(driver, None, columns.new_zeros(0), columns, OUTSIDE + log_odds, None, plain, note, begins)
 
 
 def scales(coefficients: Sequence[Coefficient], like: Tensor) -> Tensor:

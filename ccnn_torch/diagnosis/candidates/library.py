@@ -13,13 +13,12 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import Atom, default_shape
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows, Shaped
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
+from ccnn_torch.diagnosis.residual.rows import only_usable
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
+from ccnn_torch.evidence.marginal_likelihood import GroupProducts, Prior, fit_single_groups, own_products
 from ccnn_torch.evidence.priors import EFFECT
-from ccnn_torch.evidence.single_groups import GroupProducts, fit_single_groups, own_products
 
-# Spread of the log size of an effect that is in one joint or leg alone.
-_SIZE_SPREAD = 4.0
 # What it costs to be told with secondary coefficients or without.
 _EITHER = math.log(2.0)
 
@@ -45,12 +44,12 @@ def default_atom(situation: Situation, there: Situation, effect: Effect) -> Atom
 
 def without_unused_rows(atom: Atom, usable: Tensor) -> Atom:
     """With rows that are left out set to zero."""
-    return atom if bool(usable.all()) else replace(atom, columns=atom.columns.where(usable[:, None, None], 0.0))
+    return atom if bool(usable.all()) else replace(atom, columns=only_usable(atom.columns, usable))
 
 
 def candidates_about_nominal(
     situation: Situation, atoms: Sequence[Atom], white: Whitening, residual: Tensor, usable: Tensor, fitted: Tensor
-) -> tuple[list[Atom], list[Atom]]:
+) -> list[Atom]:
     """Effects without shapes, whole and in part; and those with shapes, at what suits the residual.
 
     Shapes are searched by themselves and with the rest of the library beside them: two ways to start, both stay
@@ -78,7 +77,7 @@ def candidates_about_nominal(
         for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(without_unused_rows(_atom(situation, situation, atom.effect, shaped), usable))
-    return [*whole, *parts], starts
+    return [*whole, *parts, *starts]
 
 
 def candidates_about_set(
@@ -106,7 +105,7 @@ def candidates_about_set(
     """
 
     def beside(others: Sequence[Acting]) -> Tensor:
-        return torch.where(usable[:, None], torch.nan_to_num(remainder(situation, measured, others)), 0.0)
+        return only_usable(torch.nan_to_num(remainder(situation, measured, others)), usable)
 
     def ground(others: Sequence[Acting]) -> SearchRows:
         names = tuple(a.effect.name for a in others)
@@ -183,7 +182,7 @@ def _same_shape(atom: Atom, shaped: Shaped) -> bool:
 
 def _only(white: Whitening, usable: Tensor) -> Whitening:
     """The same with rows that are left out set to zero."""
-    return replace(white, weight=torch.where(usable, white.weight, 0.0))
+    return replace(white, weight=only_usable(white.weight, usable))
 
 
 @dataclass
@@ -246,10 +245,8 @@ def single_joint_atoms(
         cut = [[GroupProducts(c.own.xx[p][:, p], c.own.xy[p]) for p in c.wider()] for c in going]
         counts = [len(group) for group in cut]
         squares = torch.stack([c.squares for c in going]).repeat_interleave(torch.tensor(counts))
-        values = float(len(y[0]) * len(white.channels))
-        evidence = fit_single_groups(
-            [own for group in cut for own in group], squares, values, 0.0, _SIZE_SPREAD
-        ).log_evidence
+        prior = Prior(float(len(y[0]) * len(white.channels)), 0.0)
+        evidence = fit_single_groups([own for group in cut for own in group], squares, prior)[0].log_evidence
         for choice, mine in zip(going, torch.split(evidence, counts), strict=True):
             choice.take(mine)
     return [_cut(atom, choices[k]) if k in choices else None for k, atom in enumerate(atoms)]

@@ -11,11 +11,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, unflatten
 
-from ccnn_torch.evidence.single_groups import GroupProducts, fit_single_groups
+from ccnn_torch.evidence.marginal_likelihood import JITTER, GroupProducts, Prior, fit_single_groups
 
-_DIGITS = 1e-13
 # Relative ridge of the regression on a candidate.
 _RIDGE = 1e-6
+# Plausible sizes that nuisance may have: it takes what it can explain, and does not leave it to candidates.
+_WIDE = 10.0
+FINE, ROUNDS = 9, 3
+"""Values between the neighbours of the best of a grid, and how often there are such between those of the last."""
 
 
 def search_charge(gain: Tensor) -> float:
@@ -99,7 +102,7 @@ class NuisanceFit:
     """What nuisance columns with their prior leave of `y`, and of any columns put beside them."""
 
     def __init__(self, y: Tensor, nuisance: Tensor) -> None:
-        """y: `s x c`; nuisance: `s x c x P`, whitened, in units of their prior scale."""
+        """y: `s x c`; nuisance: `s x c x P`, whitened, in plausible sizes."""
         self.y = self._whole = y.reshape(-1)
         self._rows = y.shape
         self._taken = y.new_zeros(0, y.numel())
@@ -116,12 +119,11 @@ class NuisanceFit:
         return other
 
     def _take(self, more: Tensor) -> None:
-        flat = more.flatten(-3, -2)
+        flat = _WIDE * more.flatten(-3, -2)
         cross = self._taken @ flat
         gram = flat.mT @ flat
         if gram.shape[-1]:
-            # Columns that are the same, far above the noise, would leave no digit of the 1.
-            ones = 1 + _DIGITS * gram.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
+            ones = 1 + JITTER * gram.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
             gram = gram - cross.mT @ cross + torch.diag_embed(ones.expand(*gram.shape[:-1]))
         factor = torch.linalg.cholesky(gram)
         # Rows whose Gram matrix is what the nuisance takes out: (I + NᵀN)^-1/2 Nᵀ.
@@ -144,7 +146,7 @@ class NuisanceFit:
         dimensions."""
         inner, b = self._beside(tried, which)
         groups = [GroupProducts(xx, xy) for xx, xy in zip(inner, b, strict=True)]
-        return fit_single_groups(groups, self._whole @ self.y, float(len(self.y)), 0.0).log_evidence
+        return fit_single_groups(groups, self._whole @ self.y, Prior(float(len(self.y)), 0.0))[0].log_evidence
 
     def _beside(self, tried: TrialColumns, which: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Of the columns, the nuisance taken out of them, among themselves and with y: `... x g x m x m`,

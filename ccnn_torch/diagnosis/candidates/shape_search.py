@@ -10,16 +10,19 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import default_shape, scales
-from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
+from ccnn_torch.diagnosis.candidates.nuisance import (
+    FINE,
+    ROUNDS,
+    NuisanceFit,
+    SharedColumns,
+    TrialColumns,
+    search_charge,
+)
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Effect, Shape, Situation
 
-# The grid, then twice this many values between the neighbours of the best.
-_FINE, _ROUNDS = 9, 3
 # Log odds, less than these being chance, for which values between those of the grid are evaluated.
 _CHANCE = 5.0
-# Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
-_LOOSE = 10.0
 # Values of the residual that the grids are evaluated on, for a start and then: so many or one in so many, whichever is
 # more, but no more than the last.
 _START, _THEN, _MOST = (900, 4), (1500, 2), 4800
@@ -82,16 +85,16 @@ class SearchRows:
     """
 
     def __init__(self, y: Tensor, others: Tensor, quick: bool = False) -> None:
-        """y: whitened residual, `s x c`; others: whitened columns, in units of their prior, `s x c x P`; quick:
+        """y: whitened residual, `s x c`; others: whitened columns, in plausible sizes, `s x c x P`; quick:
         whether a start is enough."""
         drawn = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))
         fewest, share = _START if quick else _THEN
         most = min(max(fewest, y.numel() // share), _MOST)
         count = max(1, most // max(y.shape[1], 1))
         self.rows = drawn[:count].sort().values if count < len(y) else None
-        self.left = NuisanceFit(_of(y, self.rows, 0), _LOOSE * _of(others, self.rows, 0))
+        self.left = NuisanceFit(_of(y, self.rows, 0), _of(others, self.rows, 0))
         self.times = y.numel() / self.left.y.numel()
-        self.rounds = 1 if quick else _ROUNDS
+        self.rounds = 1 if quick else ROUNDS
 
 
 class Scan:
@@ -171,7 +174,7 @@ class Scan:
         value = self.start if start is None else start
         gains = [0.0] * len(self.parts)
         charges = [0.0] * len(self.parts)
-        plain, times = ground.left.beside(_LOOSE * _of(self.unshaped, ground.rows, 0)), ground.times
+        plain, times = ground.left.beside(_of(self.unshaped, ground.rows, 0)), ground.times
         for level in range(ground.rounds + 1):
             if level == 1 and not self._promising(gains, charges):
                 break
@@ -184,7 +187,7 @@ class Scan:
                     for i, tried in enumerate(looked_at):
                         if tried is None:
                             continue
-                        own = [_LOOSE * p.one(chosen[j]) for j, p in enumerate(pieces) if sweep and j != i]
+                        own = [p.one(chosen[j]) for j, p in enumerate(pieces) if sweep and j != i]
                         left = plain.beside(torch.cat(own, -1)) if own else plain
                         # What chance explains does not grow with the rows.
                         score = times * (left.gain(tried) - tried.width) + tried.width
@@ -245,8 +248,8 @@ class Scan:
             return grid
         k = int((grid - value).abs().argmin())
         low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
-        half = (high - low) / 2 * (2 / (_FINE - 1)) ** (level - 1)
-        fine = torch.linspace(-1, 1, _FINE, dtype=grid.dtype) * half + value
+        half = (high - low) / 2 * (2 / (FINE - 1)) ** (level - 1)
+        fine = torch.linspace(-1, 1, FINE, dtype=grid.dtype) * half + value
         return fine.clamp(float(grid[0]), float(grid[-1]))
 
     def _nearest(self, candidates: Tensor, value: Tensor, part: _Part) -> int:

@@ -16,8 +16,8 @@ from ccnn_torch.diagnosis.checks.mistakes import PlausibleRows
 from ccnn_torch.diagnosis.residual.distance import distance, size_of
 from ccnn_torch.diagnosis.residual.linearisation import signature_at
 from ccnn_torch.diagnosis.residual.rows import frame_columns
+from ccnn_torch.diagnosis.residual.whitening import without_fitted
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.search.shared_noise import without_fitted
 from ccnn_torch.diagnosis.verdict.findings import size_words
 from ccnn_torch.diagnosis.verdict.judgement import Judgement, implausible_size
 from ccnn_torch.diagnosis.verdict.localisation import own_pose

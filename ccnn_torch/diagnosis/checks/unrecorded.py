@@ -14,7 +14,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import default_shape, scaled_signature
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.search.shared_noise import without_fitted
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Effect, Situation, pose_residual
 from ccnn_torch.effects.backlash import Backlash
@@ -130,16 +129,13 @@ def order_shows(analysis: Analysis, judgement: Judgement, directions: Mapping[st
     """
     if not directions:
         return False
-    white, keep = analysis.whitening, analysis.whitening.keep()
-    frames, target = (analysis.correlation(white(v)[keep]) for v in (analysis.fitted, analysis.residual[..., None]))
     drawn = torch.Generator().manual_seed(0)
     orders = [torch.randperm(len(analysis.residual), generator=drawn) for _ in range(_ORDERS)]
-    groups = []
+    every = []
     for signs in (directions, *(_by_name(_signs(analysis.situation.joints, order)) for order in orders)):
         there = replace(analysis.situation, covariates={**analysis.situation.covariates, **signs})
-        columns = scaled_signature(there, _EFFECT, default_shape(there, _EFFECT))
-        groups.append(without_fitted(frames, [target, analysis.correlation(white(columns)[keep])])[1])
-    gain, *by_chance = gain_beside(analysis.dictionary, judgement.found, groups, analysis.y)
+        every.append(scaled_signature(there, _EFFECT, default_shape(there, _EFFECT)))
+    gain, *by_chance = gain_beside(analysis.dictionary, judgement.found, analysis.whitened(every))
     return gain > _CLEARLY + 2 * max(0.0, *by_chance)
 
 

@@ -1,4 +1,5 @@
-"""Local discrepancy terms: a bump along a joint or in the workspace, with searched place and width; a periodic term.
+"""Discrepancy terms whose place is searched: a bump along a joint or in the workspace, a sine of time, a jump; and the
+product of two drivers, of which neither alone moves a joint so.
 
 Bumps of every place at once share one prior scale, and the evidence charges each of them; a dent or a table is in one
 place alone. So that place is searched, and the search is charged as that for a period is.
@@ -7,20 +8,29 @@ place alone. So that place is searched, and the search is charged as that for a 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.candidates.atom import Atom
-from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
-from ccnn_torch.diagnosis.discrepancy.interaction import interaction_discrepancies
-from ccnn_torch.diagnosis.discrepancy.smooth import joint_moves, platform_moves, spread_out, unit_range
+from ccnn_torch.diagnosis.candidates.atom import Atom, discrepancy
+from ccnn_torch.diagnosis.candidates.nuisance import (
+    FINE,
+    ROUNDS,
+    NuisanceFit,
+    SharedColumns,
+    TrialColumns,
+    search_charge,
+)
+from ccnn_torch.diagnosis.discrepancy.smooth import driver_of, joint_moves, platform_moves, spread_out, unit_range
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Situation
-from ccnn_torch.evidence.priors import OUTSIDE
 
+CROSS = " × "
+"""Between the two drivers in the name of a product."""
 # Places evaluated along a joint's track and in the workspace, and radii as shares of half the range.
 _ALONG, _WITHIN = 21, 40
 _RADII_ALONG, _RADII_WITHIN = (0.1, 0.17, 0.3), (0.25, 0.4, 0.65)
@@ -34,17 +44,35 @@ _STEP, _STEPS = 0.4, 10
 _MOST_VALUES = 1800
 # Times the noise up to which a row's residual counts.
 _BELIEVED = 20.0
-# What else is there may have so many plausible sizes.
-_LOOSE = 10.0
 # A platform turns where its rotation matrix changes by this.
 _TURNS = 1e-6
 # Periods in the time of the rows: from where the waves of any course end, to so many rows a period, or so many in all.
 _SLOWEST, _ROWS_A_PERIOD, _MOST = 8.0, 3.0, 130.0
 _PERIOD_STEP = 1 / 3
-# Values between the neighbours of the best, so often.
-_FINE, _ROUNDS = 9, 3
 # Rows before the first possible jump and after the last, and places that are tried, at most.
 _FEWEST_ROWS, _PLACES = 5, 120
+
+
+class _Ground(NamedTuple):
+    """What local terms are to explain.
+
+    Attributes:
+        white: noise, all rows weighing alike.
+        few: rows evaluated, `t`.
+        plain: what is to be explained there.
+        times: how many rows there are for each that is evaluated.
+    """
+
+    white: Whitening
+    few: Tensor
+    plain: NuisanceFit
+    times: float
+
+    def beside(self, raw: Tensor) -> tuple[SharedColumns, NuisanceFit]:
+        """Columns `s x c0 x k` [m, rad] that are multiplied, in the rows evaluated, and what is to be explained beside
+        them: what is the same in all rows is in no place."""
+        lead = self.white(raw)[self.few]
+        return SharedColumns(lead), self.plain.beside(lead)
 
 
 def local_discrepancies(
@@ -66,30 +94,12 @@ def local_discrepancies(
     y = y * (_BELIEVED / torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(_BELIEVED))
     # A place is found in a part of many rows as well.
     few = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))[: _MOST_VALUES // y.shape[1]]
-    plain = NuisanceFit(y[few], _LOOSE * white(others)[few])
-
-    def atoms(drivers: Sequence[str], points: Tensor, places: Tensor, raw: Tensor) -> list[Atom]:
-        """Those of the best bump for each driver; points: `n x s x d`; raw: the columns that its bumps multiply,
-        `n x s x c0 x m`."""
-        lead = torch.stack([white(r) for r in raw])
-        # What is the same in all places is no bump.
-        left = plain.beside(_LOOSE * lead[:, few])
-        best = _searched(points[:, few], places, lead[:, few], left, len(y) / len(few))
-        made = []
-        for driver, where, columns, place, charge in zip(drivers, points, raw, *best, strict=True):
-            if place.isnan().any():
-                continue
-            bump = _bumps(where, place[None])[:, :, None]
-            # By itself, and about the mean of the rows where the model was fitted to these. A constant of its own would
-            # let it stand for an offset of the joints, which the library knows.
-            for shift in (0.0, bump.mean(0)):
-                made.append(Atom(driver, None, raw.new_zeros(0), columns * (bump - shift), OUTSIDE - float(charge)))
-        return made
+    ground = _Ground(white, few, NuisanceFit(y[few], white(others)[few]), len(y) / len(few))
 
     middles = torch.linspace(-1, 1, _ALONG, dtype=moved.dtype).unsqueeze(-1)
     drivers = [f"joint {joint.name}" for joint in situation.mechanism.joints]
     tracks = unit_range(situation.joints).mT[..., None]
-    found = atoms(drivers, tracks, _places(middles, _RADII_ALONG), moved.movedim(-1, 0)[..., None])
+    found = _bump_terms(ground, drivers, tracks, _places(middles, _RADII_ALONG), moved.movedim(-1, 0)[..., None])
     lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
     place = unit_range(situation.pose[:, lengths] if lengths else situation.pose)
     places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
@@ -97,21 +107,41 @@ def local_discrepancies(
     platform = platform_moves(situation)
     kinds = [moved, platform]
     for raw in [torch.stack(kinds)] if moved.shape == platform.shape else [k[None] for k in kinds]:
-        found += atoms(["workspace"] * len(raw), place.expand(len(raw), -1, -1), places, raw)
-    lead = white(platform)
-    moves = white(moved)
-    found += interaction_discrepancies(situation, moved, moves, few, plain, _LOOSE)
+        found += _bump_terms(ground, ["workspace"] * len(raw), place.expand(len(raw), -1, -1), places, raw)
+    found += _products(ground, situation, moved)
     moving = {"the frame": platform, "several joints": moved}
     moving |= {f"joint {j.name}": moved[..., i : i + 1] for i, j in enumerate(situation.mechanism.joints)}
     rotation = situation.platform[1]
     if rotation is not None and float((rotation - rotation[:1]).abs().max()) > _TURNS:
         moving["the tool"] = platform[..., :3] @ rotation
-    found += jump_discrepancies(moving, {name: white(m) for name, m in moving.items()}, few, plain, _LOOSE)
+    if len(y) >= 4 * _FEWEST_ROWS:
+        found += [_jump(ground, what, columns) for what, columns in moving.items()]
     if "time" in situation.covariates:
-        found += periodic_discrepancy(
-            situation.covariates["time"], platform, lead, few, plain.beside(_LOOSE * lead[few])
-        )
+        found += _sway(ground, situation.covariates["time"], platform)
     return found
+
+
+def _bump_terms(ground: _Ground, drivers: Sequence[str], points: Tensor, places: Tensor, raw: Tensor) -> list[Atom]:
+    """Those of the best bump for each driver.
+
+    Args:
+        ground: what is to be explained.
+        drivers: `n` names.
+        points: of all rows, `n x s x d`.
+        places: to begin with, `g x (d + 2)`.
+        raw: columns that bumps multiply, `n x s x c0 x m` [m, rad].
+    """
+    lead = torch.stack([ground.white(r)[ground.few] for r in raw])
+    best = _searched(points[:, ground.few], places, lead, ground.plain.beside(lead), ground.times)
+    made = []
+    for driver, where, columns, place, charge in zip(drivers, points, raw, *best, strict=True):
+        if place.isnan().any():
+            continue
+        bump = _bumps(where, place[None])[:, :, None]
+        # By itself, and about the mean of the rows where the model was fitted to these. A constant of its own would
+        # let it stand for an offset of the joints, which the library knows.
+        made += [discrepancy(driver, columns * (bump - shift), -float(charge)) for shift in (0.0, bump.mean(0))]
+    return made
 
 
 def _places(middles: Tensor, radii: tuple[float, ...]) -> Tensor:
@@ -163,40 +193,37 @@ def _searched(points: Tensor, places: Tensor, lead: Tensor, left: NuisanceFit, t
     return torch.where(reached[:, None] > -torch.inf, place, torch.nan), charge
 
 
-def periodic_discrepancy(time: Tensor, raw: Tensor, lead: Tensor, few: Tensor, left: NuisanceFit) -> list[Atom]:
+def _sway(ground: _Ground, time: Tensor, raw: Tensor) -> list[Atom]:
     """The sine of time that explains most, its search charged, with its period in its `note`; none where there are too
     few rows for any.
 
     Args:
+        ground: what is to be explained.
         time: of each row, `s` [s].
         raw: shifts and turns of the platform, `s x c0 x k` [m, rad].
-        lead: the same whitened, `s x c x k`.
-        few: rows evaluated, `t`.
-        left: what is to be explained there.
     """
     span = float(time.max() - time.min())
     fastest = min(len(time) / _ROWS_A_PERIOD, _MOST)
     if span <= 0 or fastest < _SLOWEST + 1:
         return []
     share = (time - time.min()) / span
-    looked_at = SharedColumns(lead[few])
+    lead, left = ground.beside(raw)
 
     def gain(periods: Tensor) -> Tensor:
-        return left.gain(TrialColumns(_waves(share[few], periods)[:, :, None], looked_at))
+        return left.gain(TrialColumns(_waves(share[ground.few], periods)[:, :, None], lead))
 
     grid = torch.arange(_SLOWEST, fastest, _PERIOD_STEP, dtype=time.dtype)
     score = gain(grid)
     best, reached, step = grid[score.argmax()], float(score.max()), _PERIOD_STEP
-    for _ in range(_ROUNDS):
-        close = best + step * torch.linspace(-1, 1, _FINE, dtype=time.dtype)
+    for _ in range(ROUNDS):
+        close = best + step * torch.linspace(-1, 1, FINE, dtype=time.dtype)
         finer = gain(close)
         if float(finer.max()) > reached:
             best, reached = close[finer.argmax()], float(finer.max())
-        step *= 2 / (_FINE - 1)
-    charge = search_charge(len(lead) / len(few) * score)
+        step *= 2 / (FINE - 1)
     columns = (raw[..., None] * _waves(share, best[None])[0][:, None, None]).flatten(-2)
     note = f"what follows the time is a sway with a period of {span / float(best):.3g} s"
-    return [Atom("time", None, columns.new_zeros(0), columns, OUTSIDE - charge, note=note)]
+    return [discrepancy("time", columns, -search_charge(ground.times * score), note=note)]
 
 
 def _waves(share: Tensor, periods: Tensor) -> Tensor:
@@ -205,43 +232,79 @@ def _waves(share: Tensor, periods: Tensor) -> Tensor:
     return torch.stack([torch.sin(angle), torch.cos(angle)], -1)
 
 
-def jump_discrepancies(
-    moved: Mapping[str, Tensor], whitened: Mapping[str, Tensor], few: Tensor, plain: NuisanceFit, loose: float
-) -> list[Atom]:
-    """The likeliest jump of everything that may have moved, its search charged; `note` says what moved.
+def _jump(ground: _Ground, what: str, raw: Tensor) -> Atom:
+    """The likeliest jump, its search charged.
 
     Args:
-        moved: what may have moved -> columns of a shift of it, `s x c0 x k` [m, rad]; rows in the order measured.
-        whitened: the same, `s x c x k`.
-        few: rows evaluated, `t`.
-        plain: what is to be explained there.
-        loose: size of what else is there, in plausible sizes.
+        ground: what is to be explained.
+        what: may have moved, as `note` says.
+        raw: columns of a shift of it, `s x c0 x k` [m, rad]; rows in the order measured.
     """
-    rows = len(next(iter(moved.values())))
-    if rows < 4 * _FEWEST_ROWS:
-        return []
+    rows, (lead, left) = len(raw), ground.beside(raw)
+
+    def gain(places: Tensor) -> Tensor:
+        return left.gain(TrialColumns(_steps(ground.few, places)[..., None, None], lead))
+
     step = max(1, -(-(rows - 2 * _FEWEST_ROWS) // _PLACES))
-    number = torch.arange(rows)
-    found = []
-    for what, columns in moved.items():
-        lead = whitened[what][few]
-        shared, left = SharedColumns(lead), plain.beside(loose * lead)
-
-        def gain(places: Tensor, shared: SharedColumns = shared, left: NuisanceFit = left) -> Tensor:
-            return left.gain(TrialColumns(_steps(number[few], places)[..., None, None], shared))
-
-        places = torch.arange(_FEWEST_ROWS, rows - _FEWEST_ROWS, step)
-        score = gain(places)
-        best = int(places[score.argmax()])
-        close = torch.arange(max(best - step + 1, _FEWEST_ROWS), min(best + step, rows - _FEWEST_ROWS))
-        best = int(close[gain(close).argmax()])
-        charge = search_charge(rows / len(few) * score)
-        acting = columns * _steps(number, torch.tensor([best]))[0][:, None, None]
-        prior = OUTSIDE - charge
-        found.append(Atom("time", None, lead.new_zeros(0), acting, prior, note=f"a jump of {what}", begins=best))
-    return found
+    places = torch.arange(_FEWEST_ROWS, rows - _FEWEST_ROWS, step)
+    score = gain(places)
+    best = int(places[score.argmax()])
+    close = torch.arange(max(best - step + 1, _FEWEST_ROWS), min(best + step, rows - _FEWEST_ROWS))
+    best = int(close[gain(close).argmax()])
+    acting = raw * _steps(torch.arange(rows), torch.tensor([best]))[0][:, None, None]
+    return discrepancy("time", acting, -search_charge(ground.times * score), note=f"a jump of {what}", begins=best)
 
 
 def _steps(number: Tensor, places: Tensor) -> Tensor:
     """0 before each place and 1 from it on, `g x s`."""
     return (number >= places[:, None]).to(torch.float64)
+
+
+def _products(ground: _Ground, situation: Situation, moved: Tensor) -> list[Atom]:
+    """The pair of drivers whose product explains most in one joint, beside both of them alone; its search charged.
+
+    One term is of that joint alone, one of all joints.
+
+    Args:
+        ground: what is to be explained.
+        situation: `s` rows.
+        moved: what each joint's plausible deviation does to the pose, `s x c0 x n` [m, rad].
+    """
+    few, white = ground.few, ground.white(moved)[ground.few]
+    drivers = [_drivers(situation, k) for k in range(moved.shape[-1])]
+    pairs = list(combinations(drivers[0], 2))
+    if not pairs:
+        return []
+    scores = []
+    for k, own in enumerate(drivers):
+        lead = white[..., k : k + 1]
+        alone = torch.stack([torch.ones(len(few), dtype=lead.dtype), *(v[few] for v in own.values())], -1)
+        both = torch.stack([own[a][few] * own[b][few] for a, b in pairs])
+        left = ground.plain.beside(lead * alone[:, None])
+        scores.append(left.gain(TrialColumns(both[..., None, None], SharedColumns(lead))))
+    score = torch.stack(scores)
+    k, pair = divmod(int(score.argmax()), len(pairs))
+    first, second = (drivers[k][name] for name in pairs[pair])
+    features = torch.stack([first * second, first, second], -1)
+    name, odds = CROSS.join(pairs[pair]), -search_charge(ground.times * score.flatten())
+    every = (moved[..., None] * features[:, None, None]).flatten(-2)
+    note = f"their product moves joint {situation.mechanism.joints[k].name}"
+    return [
+        discrepancy(name, moved[..., k : k + 1] * features[:, None], odds, note=note),
+        discrepancy(name, every, odds + math.log(moved.shape[-1])),
+    ]
+
+
+def _drivers(situation: Situation, joint: int) -> dict[str, Tensor]:
+    """What may drive a joint together with something else, `s` each in [-1, 1]; loads by their torque on it."""
+    tracks = unit_range(situation.joints)
+    found = {f"joint {j.name}": tracks[:, i] for i, j in enumerate(situation.mechanism.joints)}
+    for name, value in situation.covariates.items():
+        driver = driver_of(name)
+        if driver is not None and not driver.startswith(("load", "speed")) and bool((value != value[0]).any()):
+            found[driver] = unit_range(value[:, None])[:, 0]
+    for name in (name for name in situation.covariates if name.startswith("load_")):
+        # 0 where the load does not act on this joint: every joint has the same drivers.
+        torque = situation.with_covariates({name: situation.covariates[name]}).load_torque[:, joint]
+        found[driver_of(name) or name] = torque / torque.abs().amax().clamp_min(1e-300)
+    return found

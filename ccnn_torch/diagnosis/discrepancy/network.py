@@ -129,7 +129,7 @@ def _left(analysis: Analysis, judgement: Judgement, fold: Tensor, count: int) ->
     dictionary, white = analysis.dictionary, analysis.whitening
     keep = white.keep()
     chosen = [dictionary.groups[i] for i in judgement.found.members if not dictionary.atoms[i].is_discrepancy]
-    x, y = dictionary.columns, analysis.y
+    x, y = dictionary.columns, dictionary.y
     plain_x, plain_y = analysis.plain
     weight = white.weight[keep].sqrt()[:, None]
     used = torch.cat([torch.arange(0), *chosen])
@@ -137,8 +137,7 @@ def _left(analysis: Analysis, judgement: Judgement, fold: Tensor, count: int) ->
     for k in range(count):
         rest = without(dictionary.grams, x[fold == k], y[fold == k], used)
         fit = fit_sets(rest, [chosen], dictionary.noise_dof, _UPDATES)
-        index = fit.columns[0][fit.columns[0] >= 0]
-        left.append((plain_y - plain_x[..., index] @ fit.mean[0, : len(index)]) / weight)
+        left.append((plain_y - plain_x[..., used] @ fit.mean[0]) / weight)
     return torch.stack(left)
 
 

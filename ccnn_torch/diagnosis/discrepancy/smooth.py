@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.candidates.atom import Atom
+from ccnn_torch.diagnosis.candidates.atom import Atom, discrepancy
 from ccnn_torch.effects import Situation
 from ccnn_torch.evidence.priors import OUTSIDE
 
-# A discrepancy term that holds most of what a library effect does has to be better than that effect by as much again.
-_NEAR_LIBRARY = math.log(1e-5)
+# Log odds of one that holds most of what a library effect does beside those of the others.
+_NEAR_LIBRARY = math.log(1e-2)
+# Of one form with an effect that is a candidate, it has to be better than that by as much again.
+_TWIN = 2 * OUTSIDE
 # A joint may be off by this much for unforeseen reasons [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
 ANY = "*"
@@ -59,7 +62,7 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
     found = [_atom(situation, "workspace", around, most=most)]
     found.append(
         _atom(
-            situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most, log_prior=_NEAR_LIBRARY
+            situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most, log_odds=_NEAR_LIBRARY
         )
     )
     own: list[Tensor] = []
@@ -89,9 +92,9 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
             )
         if driver.startswith("load"):
             # The torque of a load follows the Jacobian, which is not linear over the workspace.
-            features.append(_BEND * d * products(place))
+            features.append(_BEND * d * _products(place))
             found.append(
-                _atom(situation, driver, _load_features(_under(situation, name)), most=most, log_prior=_NEAR_LIBRARY)
+                _atom(situation, driver, _load_features(_under(situation, name)), most=most, log_odds=_NEAR_LIBRARY)
             )
         if driver == "temperature" and "time" in situation.covariates:
             features += [_lagged(value, situation.covariates["time"], k) for k in _LAGS]
@@ -104,7 +107,7 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
             found.append(_atom(situation, f"{kind} {ANY}", torch.cat([one, *features], -1)))
             if kind == "load":
                 found.append(
-                    _atom(situation, f"{kind} {ANY}", _load_features(situation), most=most, log_prior=_NEAR_LIBRARY)
+                    _atom(situation, f"{kind} {ANY}", _load_features(situation), most=most, log_odds=_NEAR_LIBRARY)
                 )
     return found
 
@@ -126,7 +129,7 @@ def unit_range(values: Tensor) -> Tensor:
     return (2 * values - low - high) / (high - low).clamp_min(1e-300)
 
 
-def products(place: Tensor) -> Tensor:
+def _products(place: Tensor) -> Tensor:
     """Squares and products of the coordinates, `s x (p + 1) p / 2`."""
     first, second = torch.triu_indices(place.shape[-1], place.shape[-1])
     return place[:, first] * place[:, second]
@@ -210,7 +213,7 @@ def _platform_atom(situation: Situation, driver: str, features: Tensor) -> Atom:
     """features: `s x f`; columns = shifts and turns of the platform, alike in all poses, times the features."""
     columns = (platform_moves(situation).unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
     shown = columns.abs().amax((0, 1)) > 0
-    return Atom(driver, None, features.new_zeros(0), columns[..., shown], OUTSIDE)
+    return discrepancy(driver, columns[..., shown])
 
 
 def _atom(
@@ -218,7 +221,7 @@ def _atom(
     driver: str,
     features: Tensor,
     most: int = _MOST,
-    log_prior: float = OUTSIDE,
+    log_odds: float = 0.0,
     only: int | None = None,
 ) -> Atom:
     """What the joints do by features that all of them go by, `s x f`, or each by its own, `s x n x f`.
@@ -229,7 +232,7 @@ def _atom(
     moves = moves if only is None else moves[..., only : only + 1]
     if features.dim() == 2:
         features = _principal(features, most)[:, None].expand(-1, moves.shape[-1], -1)
-    return Atom(driver, None, features.new_zeros(0), reduced(moves, features, most), log_prior)
+    return discrepancy(driver, _reduced(moves, features, most), log_odds)
 
 
 def _principal(features: Tensor, most: int) -> Tensor:
@@ -241,7 +244,7 @@ def _principal(features: Tensor, most: int) -> Tensor:
     return principal
 
 
-def reduced(moves: Tensor, features: Tensor, most: int) -> Tensor:
+def _reduced(moves: Tensor, features: Tensor, most: int) -> Tensor:
     """The leading principal columns of each joint's moves, `s x c x n`, times each of its features, `s x n x f`.
 
     With one prior scale for all, the rest is the least of what the prior allows. The columns themselves, n times f of
@@ -257,3 +260,56 @@ def reduced(moves: Tensor, features: Tensor, most: int) -> Tensor:
     kept = vectors[:, -most:].reshape(n, f, -1)
     columns: Tensor = moves @ (features.transpose(0, 1) @ kept).transpose(0, 1)
     return columns
+
+
+def linear_discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
+    """What acts through the drives, what is between base and measurement, and what the platform carries.
+
+    Through the drives: each by its own track, or all by the place of all. Most are nearly of one form with an effect of
+    the library; where that is a candidate it takes much to call the same something else.
+
+    Args:
+        situation: `s` rows.
+        beside: names of the library effects that are candidates.
+    """
+    from_middle = situation.from_middle
+    own = from_middle / from_middle.abs().amax(0).clamp_min(1e-300)
+    place = unit_range(situation.joints)
+    planes = torch.cat([torch.ones_like(place[:, :1]), place], -1)
+    curves = torch.cat([planes, _BEND * _products(place)], -1)
+    still = torch.eye(3, dtype=place.dtype).expand(len(place), 3, 3)
+    found = {
+        "joint_gain": _driven(situation, f"joint {ANY}", torch.stack([own, _BEND * own.square()], -1)),
+        "coupling": _driven(situation, "workspace", _by_all(planes, own)),
+        "geometry": _driven(situation, "workspace", _by_all(curves, own)),
+        "instrument": _carried(situation, still),
+    }
+    turned = situation.platform[1]
+    if turned is not None and float((turned - turned[:1]).abs().max()) > 1e-6:
+        found["tool"] = _carried(situation, turned)
+    found = {twin: atom for twin, atom in found.items() if atom.columns.shape[-1]}
+    return [replace(atom, log_prior=_TWIN) if twin in beside else atom for twin, atom in found.items()]
+
+
+def _by_all(features: Tensor, joints: Tensor) -> Tensor:
+    """The same features for every joint, `s x n x f`."""
+    return features[:, None].expand(-1, joints.shape[-1], -1)
+
+
+def _driven(situation: Situation, driver: str, features: Tensor) -> Atom:
+    """Joints that are off by features of their own, `s x n x f`."""
+    columns = _reduced(joint_moves(situation, situation.jacobian), features, _MOST_PLACES)
+    return discrepancy(driver, columns, plain=True)
+
+
+def _carried(situation: Situation, axes: Tensor) -> Atom:
+    """Shifts along axes, `s x 3 x 3`, by a plane over the workspace, and turns about them."""
+    lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
+    place = unit_range(situation.pose[:, lengths])
+    features = torch.cat([torch.ones_like(place[:, :1]), place], -1)
+    moves = platform_moves(situation)
+    shifts = ((moves[..., :3] @ axes)[..., None] * features[:, None, None]).flatten(-2)
+    turns = moves[..., 3:] @ axes if moves.shape[-1] == 6 else moves[..., :0]
+    columns = torch.cat([shifts, turns], -1)
+    shown = columns.abs().amax((0, 1)) > 1e-9 * columns.abs().max().clamp_min(1e-300)
+    return discrepancy("workspace", columns[..., shown], plain=True)

@@ -13,10 +13,19 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from ccnn_torch.effects import Situation
+
 # Targets from which it can be seen what their readings share.
 _FEWEST_TARGETS = 8
 # Joints that differ by less than this share of their range are of one target.
 _SAME_TARGET = 1e-6
+# Correlations from row to row, and shares of the variance that readings of a target have in common.
+_FROM_ROW, _IN_TARGET = (0.3, 0.6, 0.8, 0.9, 0.95, 0.98), (0.2, 0.5, 0.8, 0.9, 0.95, 0.99)
+# The same of a device that drifts and scatters, with the share of the variance that is of each row alone; and the rows
+# up to which that is tried, as its cost grows with their square.
+_DRIFTS, _SCATTERS, _MOST_ROWS = (0.9, 0.97, 0.99), (0.3, 0.6, 0.85), 1000
+LOG_PRIOR = math.log(0.1)
+"""Log prior odds of noise that rows share."""
 
 
 @dataclass(frozen=True)
@@ -89,3 +98,19 @@ def targets_of(joints: Tensor) -> Tensor | None:
     spread = (joints.amax(0) - joints.amin(0)).clamp_min(1e-300)
     number = torch.unique((joints / (spread * _SAME_TARGET)).round(), dim=0, return_inverse=True)[1]
     return number if _FEWEST_TARGETS <= int(number.max()) + 1 < len(number) else None
+
+
+def possible_correlations(situation: Situation, keep: Tensor) -> list[Correlation]:
+    """What may be: independent rows first.
+
+    Args:
+        situation: all rows.
+        keep: those that count, in the order measured.
+    """
+    target = targets_of(situation.joints[keep])
+    found = [INDEPENDENT, *(Correlation(value) for value in _FROM_ROW)]
+    if len(keep) <= _MOST_ROWS:
+        found += [Correlation(value, alone=alone) for value in _DRIFTS for alone in _SCATTERS]
+    if target is not None:
+        found += [Correlation(value, target) for value in _IN_TARGET]
+    return found

@@ -9,15 +9,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, LEAST_NOISE, MAD, NO_NOISE, Whitening, reweighted
-from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.evidence.single_groups import (
+from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, MAD, NO_NOISE, Whitening, renewed
+from ccnn_torch.evidence.marginal_likelihood import (
     NO_COLUMNS,
     Axes,
     GroupProducts,
+    Prior,
     axes_of,
     fit_in_axes,
+    fit_sets,
     fit_single_groups,
+    grams_of,
     own_products,
 )
 
@@ -49,7 +51,7 @@ def fitted_whitening(
     rms = residual[usable][:, channels].abs().median(0).values * MAD
     rms = rms.clamp_min(NO_NOISE)
     sigma = rms if noise is None else noise[channels]
-    white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0)
+    white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0 if noise is None else _KNOWN)
     shown = [c if len(channels) == c.shape[1] else c[:, channels] for c in columns if c.shape[-1]]
     shown = [c.to(residual.dtype) for c in shown]
     every = _Everything(shown, white)
@@ -58,7 +60,6 @@ def fitted_whitening(
         white = replace(white, sigma=sigma * _noise_share(every, y, white).sqrt())
     chosen: list[int] = []
     log_scale = y.new_zeros(1, 0)
-    least = None if noise is not None else (LEAST_NOISE * rms).clamp_min(NO_NOISE)
     left, free = y, 1.0
     for _ in range(_RICH):
         if chosen:
@@ -71,7 +72,7 @@ def fitted_whitening(
             free = max(
                 1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), LEAST_FREE
             )
-            white = _reestimated(white, left, usable, free, least)
+            white = renewed(white, left, y, free, usable)
         rest = [k for k in range(len(shown)) if k not in chosen]
         if not rest:
             break
@@ -85,8 +86,7 @@ def fitted_whitening(
             break
         chosen.append(likely[best])
         log_scale = torch.cat([log_scale, added.log_scale[None, best : best + 1]], -1)
-    white = _reestimated(white, left, usable, free, least)
-    return replace(white, known=0.0 if noise is None else _KNOWN)
+    return renewed(white, left, y, free, usable)
 
 
 class _Addition(NamedTuple):
@@ -98,7 +98,7 @@ class _Addition(NamedTuple):
 
 def _additions(products: Sequence[GroupProducts], squares: Tensor, values: int) -> _Addition:
     """products: of each candidate; squares: of what it is added to, and of how many values."""
-    fits = fit_single_groups([NO_COLUMNS, *products], squares, float(values), 0.0, _ANY_SIZE)
+    fits, _ = fit_single_groups([NO_COLUMNS, *products], squares, Prior(float(values), 0.0, _ANY_SIZE))
     return _Addition(fits.log_evidence[1:] - fits.log_evidence[0], fits.log_scale[1:])
 
 
@@ -155,7 +155,7 @@ class _Everything:
         )
         square = axes.square * (share / before).mean()
         squares, there = white.scaled(left).square().sum(), torch.ones(len(square), dtype=torch.bool)
-        return fit_in_axes(square, along, there, squares, float(left.numel()), 0.0, _ANY_SIZE).log_evidence
+        return fit_in_axes(square, along, there, squares, Prior(float(left.numel()), 0.0, _ANY_SIZE)).log_evidence
 
 
 def _spread(factors: Tensor) -> float:
@@ -177,20 +177,8 @@ def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
     target = white.scaled(y).mT
     groups = [NO_COLUMNS] * len(target) + [own for each in every.by_channel(y, white) for own in each]
     squares = target.square().sum(-1).repeat(1 + len(every.columns))
-    fits = fit_single_groups(groups, squares, float(target.shape[-1]), 0.0, _ANY_SIZE)
+    fits, _ = fit_single_groups(groups, squares, Prior(float(target.shape[-1]), 0.0, _ANY_SIZE))
     evidence, noise = fits.log_evidence.reshape(-1, len(target)), fits.noise.reshape(-1, len(target))
     best = evidence.max(0)
     left = noise.gather(0, best.indices[None])[0] / noise[0]
     return torch.where(best.values - evidence[0] > _SLIGHT, left, 1.0).clamp(1e-6, 1.0)
-
-
-def _reestimated(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:
-    """Noise (unless it is known: `least` None) and weights from what a fit leaves, `s x c`.
-
-    No channel's noise is below `least`: a perfect fit knows nothing of the noise.
-    """
-    if least is not None:
-        rows = white.weight > 0
-        spread = left[rows].abs().median(0).values * MAD / free**0.5
-        white = replace(white, sigma=torch.maximum(spread, least))
-    return reweighted(white, left, usable, free)

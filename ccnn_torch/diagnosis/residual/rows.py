@@ -57,9 +57,14 @@ def near_singular(situation: Situation, channels: Tensor) -> Tensor:
     return far
 
 
+def only_usable(values: Tensor, usable: Tensor) -> Tensor:
+    """Values by row, `s x ...`, 0 in rows that are left out; usable: `s`."""
+    return values.where(usable.reshape(-1, *[1] * (values.dim() - 1)), 0.0)
+
+
 def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
     """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back."""
     unknown = getattr(situation.mechanism, "unknown_frames", ())
     index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]
     columns = situation.parameter_jacobian[..., index] if index else situation.jacobian[..., :0]
-    return torch.where(usable[:, None, None], columns, 0.0)
+    return only_usable(columns, usable)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,10 +20,12 @@ MAD = 1.4826
 """Standard deviation of a normal variate over its median absolute deviation."""
 LEAST_FREE = 0.1
 """Share of the values that a fit leaves free, at least: no noise is estimated from fewer."""
-LEAST_NOISE = 1e-4
-"""Estimated noise, at least, as a share of the residual."""
+# Estimated noise, at least, as a share of the residual.
+_LEAST_NOISE = 1e-4
 # Quantile of the rows that are never set aside; ratio of the fourth moment to a normal one from which tails are heavy.
 _KEPT, _HEAVY = 0.8, 1.5
+# Directions of what was fitted before with less than this share of the largest one are rounding.
+_DIGITS = 1e-9
 
 
 @dataclass(frozen=True)
@@ -109,20 +112,36 @@ def without_frames(white: Whitening, left: Tensor, fitted: Tensor) -> Tensor:
     return found
 
 
-def renewed(white: Whitening, left: Tensor, residual: Tensor, free: float, is_given: bool, usable: Tensor) -> Whitening:
-    """Noise and weights from what a fit leaves.
+def without_fitted(fitted: Tensor, columns: Sequence[Tensor]) -> list[Tensor]:
+    """What was fitted before, `s x c x r` whitened, takes its part out of everything, `s x c x m` each."""
+    if not fitted.shape[-1]:
+        return [*columns]
+    u, s, _ = torch.linalg.svd(fitted.flatten(0, 1), full_matrices=False)
+    q = u[:, s > _DIGITS * s[0]]
+    return [(c.flatten(0, 1) - q @ (q.mT @ c.flatten(0, 1))).reshape(c.shape) for c in columns]
+
+
+def size_of_fitted(fitted: Tensor) -> float:
+    """Half the logarithm of the determinant of the products of what was fitted, `s x c x r` whitened."""
+    if not fitted.shape[-1]:
+        return 0.0
+    values = torch.linalg.svdvals(fitted.flatten(0, 1))
+    return float(values[values > _DIGITS * values[0]].log().sum())
+
+
+def renewed(white: Whitening, left: Tensor, residual: Tensor, free: float, usable: Tensor) -> Whitening:
+    """Noise, unless it was given, and weights from what a fit leaves: a perfect fit knows nothing of the noise.
 
     Args:
         white: before.
-        left: of the fit, `s x c0` [m, rad].
-        residual: what was fitted, `s x c0` [m, rad].
+        left: of the fit, `s x c` [m, rad].
+        residual: what was fitted, `s x c` [m, rad].
         free: share of the values that the fit leaves free.
-        is_given: whether the noise was given, and only weights are new.
         usable: rows that may count, `s`.
     """
-    left, counted = left[:, white.channels], (white.weight > 0) & usable
-    if not is_given:
+    if white.known == 0:
+        counted = (white.weight > 0) & usable
         spread = left[counted].abs().median(0).values * MAD / max(free, LEAST_FREE) ** 0.5
-        rms = residual[counted][:, white.channels].abs().median(0).values * MAD
-        white = replace(white, sigma=torch.maximum(spread, LEAST_NOISE * rms).clamp_min(NO_NOISE))
+        rms = residual[counted].abs().median(0).values * MAD
+        white = replace(white, sigma=torch.maximum(spread, _LEAST_NOISE * rms).clamp_min(NO_NOISE))
     return reweighted(white, left, usable, free)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -18,15 +20,21 @@ from ccnn_torch.diagnosis.candidates.library import (
     has_usual_shape,
     without_unused_rows,
 )
-from ccnn_torch.diagnosis.discrepancy.linear import linear_discrepancies
 from ccnn_torch.diagnosis.discrepancy.local import local_discrepancies
-from ccnn_torch.diagnosis.discrepancy.smooth import smooth_discrepancies
+from ccnn_torch.diagnosis.discrepancy.smooth import linear_discrepancies, smooth_discrepancies
 from ccnn_torch.diagnosis.progress import at_step
-from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, Correlation
+from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, LOG_PRIOR, Correlation, possible_correlations
 from ccnn_torch.diagnosis.residual.linearisation import remainder, tangent
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
-from ccnn_torch.diagnosis.residual.rows import frame_columns, near_singular
-from ccnn_torch.diagnosis.residual.whitening import Whitening, moving_channels, renewed, without_frames
+from ccnn_torch.diagnosis.residual.rows import frame_columns, near_singular, only_usable
+from ccnn_torch.diagnosis.residual.whitening import (
+    Whitening,
+    moving_channels,
+    renewed,
+    size_of_fitted,
+    without_fitted,
+    without_frames,
+)
 from ccnn_torch.diagnosis.search.convergence import (
     discrepancy_is_active,
     has_new_effects,
@@ -34,15 +42,10 @@ from ccnn_torch.diagnosis.search.convergence import (
     known_shapes,
     most_probable_shapes,
 )
-from ccnn_torch.diagnosis.search.shared_noise import (
-    Explanation,
-    likeliest_correlation,
-    possible_correlations,
-    without_fitted,
-)
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 from ccnn_torch.evidence.beam import search
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
 
 # Share of the rows at which the machine must be linearised about a set; else it is so about the nominal machine.
 _LINEARISED = 0.9
@@ -57,51 +60,96 @@ _SHOWN = 1e-9
 _START = 900
 
 
-@dataclass(frozen=True)
-class Analysis:
-    """What the rows say.
+class Rows(NamedTuple):
+    """What every search uses.
 
     Attributes:
-        situation: the rows.
+        situation: `s` rows.
         measured: poses, `s x p`.
-        residual: measured less nominal, `s x c0` [m, rad].
-        whitening: channels, noise and row weights in the end.
-        atoms: candidates in the end.
-        dictionary: their columns and Gram matrices.
-        y: what the atoms explain, whitened, `s x c`; rows that count.
-        found: sets, most probable first.
         near_singular: `s`, bool.
-        floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit or,
-            where that is far less, of the most probable set.
-        instrument: standard deviation of the noise that the records show without a model, `c0` [m, rad], or None.
-        fitted: what frames that are fitted to the rows do about the machine with the set's effects, `s x c0 x r`.
-        idle: effects that change no pose in these rows, and were no candidates.
-        correlation: of the noise between the rows that count.
-        shared: columns of all atoms and `y` before what rows share was taken out of them; None where that is nothing.
-        outside: whitened columns of every discrepancy term, by its number, in the dictionary or not, `s x c x m` each.
+        usable: rows that may count, `s`, bool.
+        effects: candidates that show in these rows.
+        idle: names of effects that change no pose in these rows.
+        discrepancies: terms that are candidates beside any set.
+        sigma: standard deviation of the noise under the largest model, `c` [m, rad].
     """
 
     situation: Situation
     measured: Tensor
+    near_singular: Tensor
+    usable: Tensor
+    effects: list[Effect]
+    idle: tuple[str, ...]
+    discrepancies: list[Atom]
+    sigma: Tensor
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What the rows say, after one search.
+
+    Attributes:
+        rows: what every search uses.
+        residual: what a linear model has to explain, `s x c0` [m, rad].
+        fitted: what frames that are fitted to the rows do about the machine with the set's effects, `s x c0 x r`.
+        whitening: channels, noise and row weights.
+        correlation: of the noise between the rows that count.
+        about: names of the effects about which the machine is linear; None = it is so about the nominal machine.
+        atoms: candidates.
+        dictionary: their columns and Gram matrices.
+        found: sets, most probable first.
+        floor: mean square of the noise in the units of the dictionary: 1 where it was given, else that of the largest
+            model or, where that is far less, of the most probable set.
+        instrument: standard deviation of the noise that the records show without a model, `c0` [m, rad], or None.
+    """
+
+    rows: Rows
     residual: Tensor
+    fitted: Tensor
     whitening: Whitening
+    correlation: Correlation
+    about: frozenset[str] | None
     atoms: tuple[Atom, ...]
     dictionary: Dictionary
-    y: Tensor
     found: list[FittedSet]
-    near_singular: Tensor
     floor: float
-    fitted: Tensor
-    idle: tuple[str, ...] = ()
-    correlation: Correlation = INDEPENDENT
-    shared: tuple[Tensor, Tensor] | None = None
-    outside: Mapping[int, Tensor] = field(default_factory=dict)
     instrument: Tensor | None = None
 
     @property
+    def situation(self) -> Situation:
+        """The rows."""
+        return self.rows.situation
+
+    @property
+    def measured(self) -> Tensor:
+        """Poses, `s x p`."""
+        return self.rows.measured
+
+    @property
+    def near_singular(self) -> Tensor:
+        """`s`, bool."""
+        return self.rows.near_singular
+
+    @property
+    def idle(self) -> tuple[str, ...]:
+        """Effects that change no pose in these rows, and were no candidates."""
+        return self.rows.idle
+
+    @property
+    def best_of_library(self) -> FittedSet:
+        """The most probable set without a discrepancy term."""
+        return next(f for f in self.found if not any(self.atoms[i].is_discrepancy for i in f.members))
+
+    @cached_property
     def plain(self) -> tuple[Tensor, Tensor]:
-        """Columns of all atoms and what they explain, as they are in the rows, `s x c x P` and `s x c`, whitened."""
-        return (self.dictionary.columns, self.y) if self.shared is None else self.shared
+        """Columns of the dictionary and what they explain, as they are in the rows, `s x c x P` and `s x c`, whitened:
+        with what rows share."""
+        y = self.dictionary.y
+        if self.correlation.value:
+            columns = [self.residual[..., None], *(self.atoms[i].columns for i in self.dictionary.groups)]
+            first, *own = _whitened(self.whitening, self.fitted, INDEPENDENT, columns)
+            return torch.cat([first[..., :0], *own], -1), first[..., 0]
+        return self.dictionary.columns, y
 
     @property
     def noise_is_known(self) -> bool:
@@ -110,8 +158,12 @@ class Analysis:
 
     @property
     def gap(self) -> float:
-        """Squares above the noise, in the units of `y`."""
+        """Squares above the noise, in the units of the dictionary."""
         return max(float(self.dictionary.grams.yy) - self.floor * self.dictionary.grams.values, 1e-300)
+
+    def whitened(self, columns: Iterable[Tensor]) -> list[Tensor]:
+        """Columns `s x c0 x m` [m, rad] in the rows that count, as those of the dictionary, `t x c x m` each."""
+        return _whitened(self.whitening, self.fitted, self.correlation, columns)
 
     def acting(self, found: FittedSet) -> list[Acting]:
         """The effects of a set with their most probable numbers; discrepancy terms are left out."""
@@ -121,53 +173,6 @@ class Analysis:
             if atom.effect is not None:
                 out.append(Acting(atom.effect, atom.shape, atom.spread(self.situation, mean)))
         return out
-
-
-class _Rows(NamedTuple):
-    """What every search uses: the rows, `measured` poses `s x p`, the `noise` that was given, rows that are `usable`
-    and those `near` a singularity, `s`; and 0 in rows that are left out: the `residual`, `s x c0`, what was `fitted` to
-    them before, `s x c0 x r`, and the joints' `jacobian`, `s x c0 x n`."""
-
-    situation: Situation
-    measured: Tensor
-    noise: Tensor | None
-    usable: Tensor
-    near: Tensor
-    residual: Tensor
-    fitted: Tensor
-    jacobian: Tensor
-
-
-class _Set(NamedTuple):
-    """What is searched about: the most probable set of the library.
-
-    Attributes:
-        acting: its effects.
-        white: noise and weights that the most probable set of all leaves.
-        left: what the effects leave by the machine itself, `s x c0` [m, rad].
-        shapes: found before.
-        local: whether local terms are searched again.
-    """
-
-    acting: Sequence[Acting]
-    white: Whitening
-    left: Tensor
-    shapes: Known
-    local: bool
-
-    @property
-    def names(self) -> frozenset[str]:
-        return frozenset(a.effect.name for a in self.acting)
-
-
-class _Fixed(NamedTuple):
-    """What stays for any findings: effects that show, discrepancy terms, those of one place or sway found at first,
-    and the noise of the richest fit, `c`."""
-
-    effects: list[Effect]
-    rest: list[Atom]
-    local: list[Atom]
-    rich: Tensor
 
 
 def analyse(
@@ -186,214 +191,167 @@ def analyse(
         noise: standard deviation of each pose channel, `c0` [m, rad], or None.
         instrument: the same as the records show it without a model: what is left above it is no noise.
     """
-    rows = _rows_of(situation, measured, noise)
-    result, fixed = _search_about_nominal(rows, effects)
-    before: frozenset[str] | None = None
+    state = _about_nominal(situation, measured, effects, noise)
     # The first search takes about a tenth of the time, the second of two about a set is often shorter.
     for done in (0.1, 0.5):
         at_step("searching the effects", done)
-        about = _next_set(rows, result, before)
-        if about is None:
+        nearer = _about_best_set(state)
+        if nearer is None:
             break
-        result, before = _search_about_set(rows, fixed, result, about), about.names
+        state = nearer
     at_step("searching the effects", 0.8)
-    result = _with_shared_noise(rows._replace(fitted=result.fitted), fixed.rich, result)
-    if instrument is not None and noise is None and result.correlation.target is None:
-        result = _above_instrument(result, instrument)
-    shown = {e.name for e in fixed.effects}
-    return replace(result, idle=tuple(e.name for e in effects if e.name not in shown))
+    state = _with_shared_noise(state)
+    if instrument is not None and noise is None and state.correlation.target is None:
+        # The floor is that of the instrument where the best fit leaves more; sets are as probable as before.
+        floor = float((instrument[state.whitening.channels] / state.whitening.sigma).square().mean())
+        state = replace(state, floor=min(state.floor, floor), instrument=instrument)
+    return state
 
 
-def _rows_of(situation: Situation, measured: Tensor, noise: Tensor | None) -> _Rows:
-    residual = pose_residual(situation, measured)
-    near = near_singular(situation, moving_channels(situation))
-    usable = torch.isfinite(residual).all(-1) & torch.isfinite(situation.jacobian).flatten(1).all(-1) & ~near
-    residual = torch.where(usable[:, None], residual, 0.0)
-    jacobian = torch.where(usable[:, None, None], situation.jacobian, 0.0)
-    return _Rows(situation, measured, noise, usable, near, residual, frame_columns(situation, usable), jacobian)
-
-
-def _search_about_nominal(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analysis, _Fixed]:
+def _about_nominal(situation: Situation, measured: Tensor, effects: Sequence[Effect], noise: Tensor | None) -> Analysis:
     """About the nominal machine, on a part of the rows: only where to start from."""
-    situation, usable = rows.situation, rows.usable
-    channels = moving_channels(situation)
+    channels, residual = moving_channels(situation), pose_residual(situation, measured)
+    near = near_singular(situation, channels)
+    usable = torch.isfinite(residual).all(-1) & torch.isfinite(situation.jacobian).flatten(1).all(-1) & ~near
+    residual, fitted = only_usable(residual, usable), frame_columns(situation, usable)
     atoms = [without_unused_rows(default_atom(situation, situation, e), usable) for e in effects]
     names = [e.name for e in effects]
     rest = [*smooth_discrepancies(situation, names), *linear_discrepancies(situation, names)]
     known = [a for a in rest if bool((torch.isfinite(a.columns.sum((1, 2))) | ~usable).all())]
     rest = [without_unused_rows(a, usable) for a in known if bool(a.columns[usable].any())]
     # What does not show at all in these rows is no candidate (latency at rest).
-    largest = rows.residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)
+    largest = residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)
     atoms = [a for a in atoms if float((a.columns[:, channels] / largest[:, None]).abs().max()) > _SHOWN]
     everything = [a.columns for a in (*atoms, *rest) if not (a.is_discrepancy and a.name.startswith("joint"))]
-    white = fitted_whitening(rows.residual, [rows.fitted, *everything], channels, rows.noise, usable)
+    white = fitted_whitening(residual, [fitted, *everything], channels, noise, usable)
 
-    atoms_of_effects, starts = candidates_about_nominal(situation, atoms, white, rows.residual, usable, rows.fitted)
-    local = local_discrepancies(situation, rows.jacobian, rows.residual, white, rows.fitted)
+    of_effects = candidates_about_nominal(situation, atoms, white, residual, usable, fitted)
+    local = local_discrepancies(situation, only_usable(situation.jacobian, usable), residual, white, fitted)
+    rest += [without_unused_rows(a, usable) for a in local]
     shown = [a.effect for a in atoms if a.effect is not None]
-    fixed = _Fixed(shown, rest, [without_unused_rows(a, usable) for a in local], white.sigma)
-    every = [*atoms_of_effects, *starts, *rest, *fixed.local]
-    few = _drawn(white.keep(), len(channels))
-    return _searched(rows, rows.residual, white, every, fixed.rich, few), fixed
+    idle = tuple(e.name for e in effects if all(e.name != s.name for s in shown))
+    rows = Rows(situation, measured, near, usable, shown, idle, rest, white.sigma)
+    drawn = torch.randperm(len(white.keep()), generator=torch.Generator().manual_seed(0))
+    few = white.keep()[drawn[: max(_START // len(channels), 1)].sort().values]
+    return _searched(rows, residual, fitted, white, [*of_effects, *rest], None, few=few)
 
 
-def _next_set(rows: _Rows, result: Analysis, before: frozenset[str] | None) -> _Set | None:
-    """The set that the next search is about, with the noise that the best set of all leaves; None where the search has
-    converged. before: effects of the set that the last search was about; None = it was about the nominal machine."""
-    dictionary, found, atoms = result.dictionary, result.found, result.atoms
-    best = next(f for f in found if not any(atoms[i].is_discrepancy for i in f.members))
+def _about_best_set(state: Analysis) -> Analysis | None:
+    """About the machine with the effects of the most probable set of the library, on all rows, under the noise that the
+    most probable set of all leaves; None where the search has converged."""
+    rows, found, atoms, best = state.rows, state.found, state.atoms, state.best_of_library
+    situation, before = rows.situation, state.about
     if before is not None and found[0].log_posterior - best.log_posterior > _MUCH_LESS_PROBABLE:
         return None
-    acting = result.acting(best)
-    white, left = _renewed(result, rows.noise, rows.usable), remainder(rows.situation, rows.measured, acting)
-    shaped = [a for a in atoms if a.effect is not None and a.shape.numel()]
-    about = _Set(acting, white, left, Known(shaped, {}, before is None), True)
+    acting = state.acting(best)
+    names = frozenset(a.effect.name for a in acting)
+    white, left = _renewed(state, rows.usable), remainder(situation, rows.measured, acting)
+    starts = [a for a in atoms if a.effect is not None and a.shape.numel()]
     if before is None:
-        starts = _kept_shapes(rows.situation, shaped, result, about.names)
-        return about._replace(shapes=about.shapes._replace(starts=starts))
-    old, sought = result.whitening, about.names if about.names == before else None
-    if not has_new_effects(dictionary, found, best, before, result.gap) and is_converged(
-        dictionary, result.y, best, old, white, without_frames(old, left, result.fitted)
-    ):
-        if torch.equal(white.keep(), old.keep()):
-            return None
-        # Other rows are set aside, and nothing else has changed.
-        sought = frozenset()
-    # Local terms are searched again only if a discrepancy term is active.
-    shapes = about.shapes._replace(kept=known_shapes(atoms, found, best, sought))
-    return about._replace(shapes=shapes, local=discrepancy_is_active(dictionary, found, best))
-
-
-def _kept_shapes(situation: Situation, starts: Sequence[Atom], result: Analysis, acting: Set[str]) -> list[Atom]:
-    """Of the shapes found at first those that stay candidates: of effects that act all, since what else acts now may
-    have hidden the better ones, and of the others the likeliest and that of the textbook."""
-    likely = most_probable_shapes(result.atoms, result.found)
-    return [a for a in starts if a.name in acting or a is likely.get(a.name) or has_usual_shape(situation, a)]
-
-
-def _search_about_set(rows: _Rows, fixed: _Fixed, result: Analysis, about: _Set) -> Analysis:
-    """About the machine with the set's effects, on all rows; result: of the search before."""
-    situation, usable = rows.situation, rows.usable
-    there, target = tangent(situation, about.left, about.acting)
-    ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
-    if int(ok.sum()) < _LINEARISED * int(usable.sum()):
-        there, target, ok = situation, rows.residual, usable
-    target = torch.where(ok[:, None], target, 0.0)
-    white = about.white if bool((ok == usable).all()) else _renewed(result, rows.noise, ok)
-    rows = rows._replace(fitted=frame_columns(there, ok))
-    atoms = candidates_about_set(
-        situation,
-        there,
-        rows.measured,
-        target,
-        fixed.effects,
-        about.acting,
-        about.shapes,
-        white,
-        ok,
-        rows.fitted,
+        # Of the shapes found at first stay those of effects that act, since what else acts now may have hidden the
+        # better ones, and of the others the likeliest and that of the textbook.
+        likely = most_probable_shapes(atoms, found)
+        starts = [a for a in starts if a.name in names or a is likely.get(a.name) or has_usual_shape(situation, a)]
+        shapes, local = Known(starts, {}, True), True
+    else:
+        sought = names if names == before else None
+        framed = without_frames(state.whitening, left, state.fitted)
+        if not has_new_effects(state.dictionary, found, best, before, state.gap) and is_converged(
+            state.dictionary, best, state.whitening, white, framed
+        ):
+            if torch.equal(white.keep(), state.whitening.keep()):
+                return None
+            # Other rows are set aside, and nothing else has changed.
+            sought = frozenset()
+        shapes = Known(starts, known_shapes(atoms, found, best, sought), False)
+        # Local terms are searched again only if a discrepancy term is active.
+        local = discrepancy_is_active(state.dictionary, found, best)
+    there, target = tangent(situation, left, acting)
+    ok = rows.usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
+    if int(ok.sum()) < _LINEARISED * int(rows.usable.sum()):
+        there, target, ok = situation, pose_residual(situation, rows.measured), rows.usable
+    target, fitted = only_usable(target, ok), frame_columns(there, ok)
+    white = white if bool((ok == rows.usable).all()) else _renewed(state, ok)
+    every = candidates_about_set(
+        situation, there, rows.measured, target, rows.effects, acting, shapes, white, ok, fitted
     )
-    again: list[Atom] = []
-    if about.local:
-        # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
-        newest = {a.name: a.columns for a in reversed(atoms)}
-        beside = torch.cat([rows.fitted, *(newest[name] for name in sorted(about.names))], -1)
-        again = local_discrepancies(situation, rows.jacobian, target, white, beside)
-    every = [*atoms, *fixed.rest, *fixed.local, *(without_unused_rows(a, ok) for a in again)]
-    return _searched(rows, target, white, every, fixed.rich)
+    # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
+    newest = {a.name: a.columns for a in reversed(every)}
+    every += rows.discrepancies
+    if local:
+        beside = torch.cat([fitted, *(newest[name] for name in sorted(names))], -1)
+        jacobian = only_usable(situation.jacobian, rows.usable)
+        again = local_discrepancies(situation, jacobian, target, white, beside)
+        every += [without_unused_rows(a, ok) for a in again]
+    return _searched(rows, target, fitted, white, every, names)
 
 
-def _above_instrument(result: Analysis, instrument: Tensor) -> Analysis:
-    """The noise floor is that of the instrument where the best fit leaves more; sets are as probable as before."""
-    white = result.whitening
-    floor = float((instrument[white.channels] / white.sigma).square().mean())
-    return replace(result, floor=min(result.floor, floor), instrument=instrument)
-
-
-def _with_shared_noise(rows: _Rows, rich: Tensor, result: Analysis) -> Analysis:
+def _with_shared_noise(state: Analysis) -> Analysis:
     """The same candidates under noise that rows share, where the best sets found are more probable then."""
-    white, atoms = result.whitening, result.atoms
-    keep = white.keep()
-    library = next(f for f in result.found if not any(atoms[i].is_discrepancy for i in f.members))
-    sets = [
-        Explanation([white(atoms[i].columns)[keep] for i in members], sum(atoms[i].log_prior for i in members))
-        for members in {(), library.members, result.found[0].members}
-    ]
-    correlation = likeliest_correlation(
-        white(result.residual)[keep],
-        white(rows.fitted)[keep],
-        sets,
-        possible_correlations(rows.situation, keep),
-        result.dictionary.noise_dof,
-    )
+    atoms, white, keep, dof = state.atoms, state.whitening, state.whitening.keep(), state.dictionary.noise_dof
+    sets = {(), state.best_of_library.members, state.found[0].members}
+
+    def log_posterior(correlation: Correlation) -> float:
+        """Of the most probable of the sets."""
+        score = correlation.log_determinant(*state.dictionary.y.shape) + (LOG_PRIOR if correlation.value else 0.0)
+        # What any size of the frames is as probable for.
+        score -= size_of_fitted(correlation(white(state.fitted)[keep]))
+        best = -math.inf
+        for members in sets:
+            raw = [state.residual[..., None], *(atoms[i].columns for i in members)]
+            target, *columns = _whitened(white, state.fitted, correlation, raw)
+            widths = [c.shape[-1] for c in columns]
+            groups = [*torch.split(torch.arange(sum(widths)), widths)] if widths else []
+            fit = fit_sets(grams_of(torch.cat([target[..., :0], *columns], -1), target[..., 0]), [groups], dof)
+            best = max(best, float(fit.log_evidence[0]) + sum(atoms[i].log_prior for i in members))
+        return score + best
+
+    correlation = max(possible_correlations(state.situation, keep), key=log_posterior)
     if not correlation.value:
-        return result
-    return _searched(rows, result.residual, white, [*atoms], rich, correlation=correlation)
+        return state
+    return _searched(state.rows, state.residual, state.fitted, white, atoms, state.about, correlation)
 
 
 def _searched(
-    rows: _Rows,
+    rows: Rows,
     target: Tensor,
+    fitted: Tensor,
     white: Whitening,
-    atoms: list[Atom],
-    rich: Tensor,
-    few: Tensor | None = None,
+    atoms: Sequence[Atom],
+    about: frozenset[str] | None,
     correlation: Correlation = INDEPENDENT,
+    few: Tensor | None = None,
 ) -> Analysis:
-    """target: what a linear model has to explain, `s x c0`; rich: noise of the richest fit, `c`; few: rows for a quick
-    look, `t`; None = all that count, thoroughly; correlation: of the noise of the rows that count."""
-    keep = white.keep() if few is None else few
-    counted = slice(None) if len(keep) == len(target) else keep
-    columns, y = [white(a.columns)[counted] for a in atoms], white(target)[counted]
-    fitted = white(rows.fitted)[counted]
-    plain = without_fitted(fitted, [y[..., None], *columns]) if correlation.value else []
-    fitted, y, columns = correlation(fitted), correlation(y), [correlation(c) for c in columns]
-    first, *columns = without_fitted(fitted, [y[..., None], *columns])
+    """few: rows for a quick look, `t`; None = all that count, thoroughly; the others as in `Analysis`."""
+    first, *columns = _whitened(white, fitted, correlation, [target[..., None], *(a.columns for a in atoms)], few)
     y = first[..., 0]
     # Noise that was given is right to some per cent, however many rows there are.
     known = white.known * (1 + y.numel() / _VALUES_A_UNIT)
     dictionary, found = search(atoms, columns, y, known, quick=few is not None)
-    shared = None
-    if plain:
-        x = torch.zeros_like(dictionary.columns)
-        for i, group in dictionary.groups.items():
-            x[..., group] = plain[1 + i]
-        shared = x, plain[0][..., 0]
-    # The richest fit knows no shapes: where these are most of the gap the best set leaves far less.
+    # The largest model knows no shapes: where these are most of the gap the best set leaves far less.
     left = found[0].rss / max(y.numel() - found[0].effective, 1.0)
-    floor = min(float((rich / white.sigma).square().mean()), 1.0)
+    floor = min(float((rows.sigma / white.sigma).square().mean()), 1.0)
     # Nor does it know what rows share.
     floor = left if white.known == 0 and (correlation.value or left < _NOISE_REDUCTION * floor) else floor
-    return Analysis(
-        rows.situation,
-        rows.measured,
-        target,
-        white,
-        tuple(atoms),
-        dictionary,
-        y,
-        found,
-        rows.near,
-        floor,
-        rows.fitted,
-        correlation=correlation,
-        shared=shared,
-        outside={i: c for i, (a, c) in enumerate(zip(atoms, columns, strict=True)) if a.is_discrepancy},
-    )
+    return Analysis(rows, target, fitted, white, correlation, about, tuple(atoms), dictionary, found, floor)
 
 
-def _drawn(rows: Tensor, channels: int) -> Tensor:
-    """As many of the rows as are enough to start from, in order."""
-    drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[: max(_START // channels, 1)]
-    return rows[drawn.sort().values]
+def _whitened(
+    white: Whitening, fitted: Tensor, correlation: Correlation, values: Iterable[Tensor], rows: Tensor | None = None
+) -> list[Tensor]:
+    """Values `s x c0 x m` each in the rows that count, or in these rows, `t x c x m`: in units of the noise, without
+    what rows share and without what was fitted."""
+    keep = white.keep() if rows is None else rows
+    counted = slice(None) if len(keep) == len(fitted) else keep
+    frames, *columns = [correlation(white(v)[counted]) for v in (fitted, *values)]
+    return without_fitted(frames, columns)
 
 
-def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitening:
+def _renewed(state: Analysis, usable: Tensor) -> Whitening:
     """Noise and weights from what the most probable set of all and the frames beside it leave."""
-    best = result.found[0]
-    left = result.residual
+    white, best, left = state.whitening, state.found[0], state.residual
     for i, mean in zip(best.members, best.mean, strict=True):
-        left = left - result.atoms[i].columns @ mean
-    free = 1 - best.effective / max(result.dictionary.grams.values, 1.0)
-    left = without_frames(result.whitening, left, result.fitted)
-    return renewed(result.whitening, left, result.residual, free, noise is not None, usable)
+        left = left - state.atoms[i].columns @ mean
+    free = 1 - best.effective / max(state.dictionary.grams.values, 1.0)
+    left = without_frames(white, left, state.fitted)
+    return renewed(white, left[:, white.channels], state.residual[:, white.channels], free, usable)

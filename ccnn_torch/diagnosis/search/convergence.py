@@ -24,15 +24,12 @@ _SAME_NOISE, _SAME_FIT = 0.2, 0.01
 _BEHIND, _SHARE = 20.0, 0.05
 
 
-def is_converged(
-    dictionary: Dictionary, y: Tensor, best: FittedSet, old: Whitening, new: Whitening, left: Tensor
-) -> bool:
+def is_converged(dictionary: Dictionary, best: FittedSet, old: Whitening, new: Whitening, left: Tensor) -> bool:
     """Whether the channels' noise is in the same proportion as before, and what the best set leaves of every row by the
     machine itself is what the linear model says.
 
     Args:
         dictionary: candidates.
-        y: what they explained, whitened, `s x c`; rows that count.
         best: the set.
         old, new: noise and weights then, and with what the fits leave.
         left: what the set leaves by the machine itself, `s x c0` [m, rad].
@@ -40,7 +37,7 @@ def is_converged(
     change = (new.sigma / old.sigma).log()
     if float((change - change.mean()).abs().max()) > _SAME_NOISE:
         return False
-    linear = y
+    linear = dictionary.y
     for i, mean in zip(best.members, best.mean, strict=True):
         linear = linear - dictionary.columns[..., dictionary.groups[i]] @ mean
     return float((old(torch.nan_to_num(left))[old.keep()] - linear).square().mean()) < _SAME_FIT

@@ -22,7 +22,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     Rows are dealt to the folds in runs of neighbours, at random: neighbours in time share more than others do.
     """
     keep = analysis.whitening.keep()
-    x, y = analysis.dictionary.columns, analysis.y
+    x, y = analysis.dictionary.columns, analysis.dictionary.y
     # What is left of a row is that of the row itself, whatever it shares with others.
     plain_x, plain_y = analysis.plain
     fold = folds(len(keep), seed)
@@ -45,7 +45,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
             fits = fit_sets(rest, [groups[i] for i in part], analysis.dictionary.noise_dof, updates, start=start)
             reached[part[0]] = fits.log_scale, fits.noise
             for row, i in enumerate(part):
-                columns = fits.columns[row][fits.columns[row] >= 0]
+                columns = torch.cat([torch.arange(0), *groups[i]])
                 m = len(columns)
                 here = plain_x[there][..., columns]
                 left[i][there] = plain_y[there] - here @ fits.mean[row, :m]

@@ -163,11 +163,12 @@ def _second_driver(analysis: Analysis, posterior: Posterior, found: FittedSet) -
     # All drivers of one kind are one driver.
     kind = first.removesuffix(ANY) if first.endswith(ANY) else None
     own = [n == first or n.endswith(ANY) or (kind is not None and n.startswith(kind)) for n in (a.name for a in atoms)]
-    more = [i for i in analysis.outside if not own[i]]
+    more = [i for i, atom in enumerate(atoms) if atom.is_discrepancy and not own[i]]
     if not more:
         return ()
     known = _fits(dictionary, [found.members], {f.members: f for f in posterior.found})[0]
-    gains = gain_beside(dictionary, known, [analysis.outside[i] / size for i in more], analysis.y / size)
+    columns = analysis.whitened(atoms[i].columns for i in more)
+    gains = gain_beside(dictionary, known, [c / size for c in columns])
     odds, best = max((gain + atoms[i].log_prior, i) for gain, i in zip(gains, more, strict=True))
     return (atoms[best].name,) if odds > 0 else ()
 
