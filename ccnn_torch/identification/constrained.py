@@ -280,7 +280,10 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
     given, key = about.tolerance, "constraint.tolerance"
     one = 0.01 if isinstance(given, dict) else size(given, None, key)
     links = [p for p in mechanism.geometry if p.name in free and not p.name.startswith("tool_")]
-    values = sizes_by_name(given if isinstance(given, dict) else {}, links, key, [one] * len(links)).tolist()
+    # The default is for lengths and angles, whichever of them there are.
+    others = {"m", "rad"} - {p.unit for p in links}
+    named = {name: v for name, v in given.items() if name not in others} if isinstance(given, dict) else {}
+    values = sizes_by_name(named, links, key, [one] * len(links)).tolist()
     if any(not v > 0 for v in values):
         raise InputError(
             f"{key}: {min(values):g} is no standard deviation; write a size above 0, or fix the parameters"

@@ -12,7 +12,7 @@ from ccnn_torch.config.sizes import sizes_of_joints, sizes_of_pose
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames, load_mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, fit_frames, judge_frames, load_mechanism
 from ccnn_torch.records import Records, check_rows, load_records
 
 # Each round of `command` shrinks the remainder by about the relative size of the errors.
@@ -167,20 +167,14 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
 
 
 def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[Records, Mechanism]:
-    """Records that fit a mechanism, and the mechanism as it was measured there (with or without orientation)."""
+    """Records that fit a mechanism, and the mechanism as it was measured there (of its pose all, or a part)."""
     records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
-    if isinstance(mechanism, SerialArm):
-        if mechanism.frame_per or mechanism.tool_per:
-            raise InputError(
-                f"{config.mechanism}: frame_per and tool_per give each group of rows a frame of its own; remove them "
-                "to identify one machine, or identify from the rows of one group"
-            )
-        if records.orientation == "none" and mechanism.orientation != "none":
-            mechanism = mechanism.with_orientation("none")
-    elif len(records.pose_coordinates) != len(mechanism.pose):
-        there = {c.name for c in records.pose_coordinates}
-        missing = [c.header for c in mechanism.pose if c.name not in there]
-        raise InputError(f"{records.path}: {mechanism.name} needs the columns {', '.join(missing)}, too")
+    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+        raise InputError(
+            f"{config.mechanism}: frame_per and tool_per give each group of rows a frame of its own; remove them to "
+            "identify one machine, or identify from the rows of one group"
+        )
+    mechanism = as_measured(mechanism, records.pose_coordinates, records.path)
     if not config.frame.base and not config.frame.tool:
         check_rows(records, mechanism)
         _check_joints(records, mechanism)

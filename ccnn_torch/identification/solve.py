@@ -27,9 +27,10 @@ from ccnn_torch.identification import (
 from ccnn_torch.identification.config import PER_LEG, IdentifyConfig, base_method
 from ccnn_torch.identification.measured import Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
+from ccnn_torch.identification.problems.poses import compares_poses
 from ccnn_torch.identification.problems.problem import part_of
 from ccnn_torch.identification.solvers.registry import get_solver
-from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
+from ccnn_torch.mechanisms import Framed, Mechanism
 from ccnn_torch.training import load_checkpoint, save_checkpoint
 
 QUICK = ("lm", "tikhonov")
@@ -104,8 +105,7 @@ def _problem(
     measured: Measured, config: IdentifyConfig, rows: Rows, machines: Tensor, per_leg: bool, near: Tensor | None
 ) -> Problem:
     forward = config.residual == "forward" or (
-        config.residual == "auto"
-        and (isinstance(measured.mechanism, SerialArm) or config.frame.base or config.frame.tool)
+        config.residual == "auto" and (compares_poses(measured.mechanism) or config.frame.base or config.frame.tool)
     )
     if forward and per_leg:
         raise InputError(

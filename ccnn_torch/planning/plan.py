@@ -10,7 +10,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.parameters import ParameterChoice, select_parameters
-from ccnn_torch.identification.problems.poses import Noise, forward_problem, inverse_problem
+from ccnn_torch.identification.problems.poses import Noise, compares_poses, forward_problem, inverse_problem
 from ccnn_torch.identification.problems.problem import Problem, Progress, split_by_leg
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.planning.candidates import (
@@ -262,7 +262,7 @@ def _problem(
     if residual not in ("auto", "inverse", "forward"):
         raise InputError(f"residual: must be auto, inverse or forward, not '{residual}'")
     of_pose, of_joints = noise
-    if residual == "forward" or (residual == "auto" and _needs_forward(mechanism)):
+    if residual == "forward" or (residual == "auto" and compares_poses(mechanism)):
         if per_leg:
             raise InputError(
                 "per_leg: a pose depends on the parameters of all legs; plan from joints (residual=inverse) or for all "
@@ -280,11 +280,6 @@ def _problem(
         joint_noise=of_joints,
         per_leg=per_leg,
     )
-
-
-def _needs_forward(mechanism: Mechanism) -> bool:
-    """Serial arms, whose inverse is a search; and poses in a frame of their own (base_x …), which a leg alone lacks."""
-    return bool(mechanism.orientations) or any(p.name.startswith(("base_", "tool_")) for p in mechanism.geometry)
 
 
 def _check_count(rows: Tensor, prior_sd: Tensor, count: int, repeat: bool) -> None:

@@ -109,6 +109,18 @@ def inverse_problem(
 _TURN = ("rx", "ry", "rz")
 
 
+def compares_poses(mechanism: Mechanism) -> bool:
+    """Whether measured poses are compared with computed ones, since the joints of a pose are a search or not unique.
+
+    So of serial arms, of poses in a frame of their own (base_x …), which a leg alone lacks, and of a machine that has
+    more joints than pose coordinates and computes its pose from them.
+    """
+    if mechanism.orientations or any(p.name.startswith(("base_", "tool_")) for p in mechanism.geometry):
+        return True
+    computed = type(mechanism).forward_kinematics is not Mechanism.forward_kinematics
+    return computed and len(mechanism.joints) > len(mechanism.pose)
+
+
 def forward_problem(
     mechanism: Mechanism,
     joints: Tensor,
