@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
+from ccnn_torch.config.split import HeldOutConfig, held_out_notes
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.splits import Split, fold_splits, split_rows
 
@@ -33,6 +34,23 @@ def test_random_is_the_first_70_percent_of_the_permutation(rows: int, seed: int)
     rest = permutation[: int(0.7 * rows)]
     cut = int(0.8 * len(rest))
     assert sets(split) == (set(rest[:cut]), set(rest[cut:]), set(permutation[int(0.7 * rows) :]))
+
+
+def test_readings_of_one_target_are_held_out_together() -> None:
+    """Five cycles over twelve targets: a target that was trained on is no new one."""
+    targets = torch.arange(12, dtype=torch.float64).repeat(5)[:, None].expand(-1, 2)
+    split = split_rows(torch.zeros(60, 3), "random", test=0.25, validation=0.2, seed=1, targets=targets)
+    parts = [set(targets[rows, 0].tolist()) for rows in (split.train, split.validation, split.test)]
+    assert [len(part) for part in parts] == [7, 2, 3] and len(set.union(*parts)) == 12
+    assert held_out_notes(HeldOutConfig(), len(split.test), split) == [
+        "Held out: the 15 rows of 3 of 12 targets, so that no target is in both parts."
+    ]
+    for fold in fold_splits(split, "random", 3, 0):
+        assert not set(targets[fold.train, 0].tolist()) & set(targets[fold.validation, 0].tolist())
+    # Every row another target, or too few of them: rows are drawn as ever.
+    for other in (torch.arange(60.0)[:, None], torch.arange(60)[:, None] % 3):
+        alone = split_rows(torch.zeros(60, 3), test=0.25, validation=0.2, seed=1, targets=other)
+        assert alone.groups is None and sets(alone) == sets(split_rows(torch.zeros(60, 3), test=0.25, seed=1))
 
 
 @pytest.mark.parametrize("rows, test, expected", [(125, 0.2, 25), (152, 27 / 152, 27), (10, 0.3, 3), (10, 0.1, 1)])

@@ -127,6 +127,7 @@ def split_by(
     seed: int,
     validation: float,
     held: Tensor | None = None,
+    targets: Tensor | None = None,
 ) -> Split:
     """Split rows by a config.
 
@@ -134,10 +135,11 @@ def split_by(
         positions: `rows x d` [m].
         columns: the columns that the config may name, `rows` each.
         held: which rows are from the test file, `rows` bool, as `rows_of_test_file` gives them.
+        targets: commanded joints, `rows x n`, as of `split_rows`.
     """
     test = split.test if held is None else held
     assert not isinstance(test, str)
-    return split_rows(positions, split.kind, split.by, columns, test, validation, seed, split.test_values)
+    return split_rows(positions, split.kind, split.by, columns, test, validation, seed, split.test_values, targets)
 
 
 def rows_of_test_file(split: HeldOutConfig, parts: Sequence[tuple[str, int]]) -> Tensor | None:
@@ -149,11 +151,19 @@ def rows_of_test_file(split: HeldOutConfig, parts: Sequence[tuple[str, int]]) ->
     return held
 
 
-def held_out_notes(split: HeldOutConfig, rows: int) -> list[str]:
-    """A note on the held-out rows if they were not drawn at random. rows: their number."""
+def held_out_notes(split: HeldOutConfig, rows: int, drawn: Split | None = None) -> list[str]:
+    """A note on the held-out rows if they were not drawn one by one at random.
+
+    Args:
+        rows: their number.
+        drawn: the split, where rows may share targets.
+    """
     if split.test_file is not None:
         return [f"Held out: all {rows} rows of {Path(split.test_file).name}."]
     if split.kind == "column" and split.by and split.test_values:
         values = ", ".join(f"{value:g}" for value in split.test_values)
         return [f"Held out: the {rows} rows whose {split.by[0]} is {values}."]
+    if split.kind == "random" and drawn is not None and drawn.groups is not None:
+        held, every = (len(set(numbers.tolist())) for numbers in (drawn.groups[drawn.test], drawn.groups))
+        return [f"Held out: the {rows} rows of {held} of {every} targets, so that no target is in both parts."]
     return []

@@ -15,7 +15,7 @@ from torch import Tensor
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.measured import Measured, Rows, read_records, split_records
+from ccnn_torch.identification.measured import Measured, Rows, read_records, rows_of_split, split_records
 from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, fit_frames
 from ccnn_torch.numerics.least_squares import jacobian_of
 
@@ -240,7 +240,7 @@ def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | 
         )
     records, arm = read_records(config, config.transfer, mechanism)
     assert isinstance(arm, SerialArm)
-    return Elsewhere(arm, *split_records(config, records))
+    return Elsewhere(arm, *rows_of_split(records, split_records(config, records)))
 
 
 def transferred(config: IdentifyConfig, elsewhere: Elsewhere, values: Tensor) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, fit_frames, judge_frames, load_mechanism
 from ccnn_torch.records import Records, check_rows, load_records
+from ccnn_torch.records.splits import Split
 
 # Each round of `command` shrinks the remainder by about the relative size of the errors.
 _COMMAND_ROUNDS = 6
@@ -146,7 +147,8 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
     assert config.records is not None
     source = with_test_file(config.records if given is None else given, config.split)
     records, mechanism = read_records(config, source, mechanism)
-    train, test = split_records(config, records)
+    split = split_records(config, records)
+    train, test = rows_of_split(records, split)
     start = _start(mechanism, train)
     far = []
     if isinstance(mechanism, SerialArm):
@@ -162,7 +164,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),
         joint_noise=None if joint_noise is None else sizes_of_joints(joint_noise, mechanism.joints, "joint_noise"),
         data_hash=records.data_hash,
-        notes=[*held_out_notes(config.split, test.joints.shape[1]), *_notes(records), *far],
+        notes=[*held_out_notes(config.split, len(split.test), split), *_notes(records), *far],
     )
 
 
@@ -192,10 +194,14 @@ def _check_joints(records: Records, mechanism: Mechanism) -> None:
         )
 
 
-def split_records(config: IdentifyConfig, records: Records) -> tuple[Rows, Rows]:
-    """Rows to identify from, and rows that judge."""
+def split_records(config: IdentifyConfig, records: Records) -> Split:
+    """Which rows are to identify from, and which judge."""
     held = rows_of_test_file(config.split, records.parts)
-    split = split_by(config.split, records.positions, records.columns, config.seed, 0.0, held)
+    return split_by(config.split, records.positions, records.columns, config.seed, 0.0, held, records.joints)
+
+
+def rows_of_split(records: Records, split: Split) -> tuple[Rows, Rows]:
+    """Rows to identify from, and rows that judge."""
     train, test = (Rows(records.joints[None, i], records.pose[None, i]) for i in (split.train, split.test))
     return train, test
 

@@ -2,7 +2,8 @@
 
 Four kinds, each a function of the rows and one seed:
 
-* ``random``: single rows at random. Rows of one target pose may be in both parts, which makes the figures optimistic.
+* ``random``: rows at random, those of one target (the same joints were commanded) together: readings of a target that
+  was trained on show how well it repeats, not how well the model knows others.
 * ``group``: whole groups at random. `by` is a column or ``position:5mm``, the default: rows whose measured positions
   round to the same cell of 5 mm share a target pose and form a group. Several entries, or a pattern such as ``goal_*``,
   make a group of the rows that are alike in all. A column that is named counts alone: where many groups visit the same
@@ -41,6 +42,7 @@ DEFAULT_BY = "position:5mm"
 
 # Values that a sentence lists.
 _FEW = 8
+_FEWEST_TARGETS = 5
 _FOLDS = 1
 """Beside the seed of a repeat, so that folds are not drawn like the split."""
 
@@ -73,6 +75,7 @@ def split_rows(
     validation: float = 0.2,
     seed: int = 0,
     test_values: Sequence[float] | None = None,
+    targets: Tensor | None = None,
 ) -> Split:
     """Split rows.
 
@@ -91,6 +94,7 @@ def split_rows(
         validation: share of the rest, from 0.
         seed: seed of the draw; a block split draws nothing.
         test_values: values of the column `by` whose rows are held out (``column``), as in `columns`.
+        targets: commanded joints, `rows x n`; rows alike in all are of one target (``random``). None = no two are.
 
     Raises:
         InputError: an unknown kind or column, a share out of range, a value that does not occur, or too few rows or
@@ -113,15 +117,27 @@ def split_rows(
     if kind == "random":
         if by is not None:
             raise InputError(f"split.by: '{by}' has no meaning with split.kind=random; write split.kind=group")
+        places = None if targets is None else number_targets(targets)
         if isinstance(test, Tensor):
-            return _hold_out(test.numpy(), None, validation, seed)
-        return _draw(np.arange(rows), test, validation, seed, "rows")
+            return _hold_out(test.numpy(), places, validation, seed)
+        if places is None:
+            return _draw(np.arange(rows), test, validation, seed, "rows")
+        return replace(_draw(places, test, validation, seed, "targets"), groups=torch.from_numpy(places))
     groups = _groups(positions, DEFAULT_BY if by is None else by, columns or {})
     if isinstance(test, Tensor):
         return _hold_out(test.numpy(), groups, validation, seed)
     if kind == "group":
         return replace(_draw(groups, test, validation, seed, "groups"), groups=torch.from_numpy(groups))
     return _block(positions.numpy(), groups, test, validation)
+
+
+def number_targets(joints: Tensor) -> _Integers | None:
+    """Number of each row's target, `rows`: rows of the same joints `rows x n` share one. None where no two do.
+
+    Targets too few to be dealt to parts are none: then every row is one of its own.
+    """
+    places = np.unique(joints.numpy(), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    return places if _FEWEST_TARGETS <= places.max(initial=0) + 1 < len(places) else None
 
 
 def fold_splits(split: Split, kind: str, folds: int, seed: int) -> list[Split]:

@@ -216,12 +216,12 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     if isinstance(mechanism, SerialArm) and config.geometry != "none":
         mechanism = mechanism.with_link_frames()
     held = rows_of_test_file(config.split, records.parts)
-    splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds, held)
+    splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds, held, records.joints)
     settings = _pseudoerror_settings(config, mechanism)
     choice, verdict, said = _choice(config, mechanism, records, splits[0], settings, verdict)
     notes = [*doubts, *records.notes, *said, choice.why]
     prepared = _fitted_to(Source(mechanism, records, settings, choice, verdict), splits, seeds)
-    notes = [*held_out_notes(config.split, len(splits[0].test)), *notes, *prepared.notes]
+    notes = [*held_out_notes(config.split, len(splits[0].test), splits[0]), *notes, *prepared.notes]
     return replace(prepared, notes=notes)
 
 
@@ -331,10 +331,15 @@ def _pseudoerror_settings(config: RunConfig, mechanism: Mechanism) -> dict[str, 
 
 
 def _splits(
-    config: RunConfig, positions: Tensor, columns: Mapping[str, Column], seeds: list[int], held: Tensor | None = None
+    config: RunConfig,
+    positions: Tensor,
+    columns: Mapping[str, Column],
+    seeds: list[int],
+    held: Tensor | None = None,
+    targets: Tensor | None = None,
 ) -> list[Split]:
     split = config.split
-    return [split_by(split, positions, columns, seed, split.validation, held) for seed in seeds]
+    return [split_by(split, positions, columns, seed, split.validation, held, targets) for seed in seeds]
 
 
 def _hash(*tensors: Tensor) -> str:
