@@ -87,6 +87,12 @@ def _changed(key: str, value: Any, change: Callable[[str], str]) -> Any:
     """The value of a key with each path in it changed."""
     if key == "records":
         return _changed_files(value, change)
+    if key == "constraint" and isinstance(value, dict) and isinstance(value.get("beside"), list):
+        beside = [
+            {name: _changed(name, entry, change) for name, entry in one.items()} if isinstance(one, dict) else one
+            for one in value["beside"]
+        ]
+        return {**value, "beside": beside}
     if key == "split" and isinstance(value, dict) and "test" in value:
         return {**value, "test": _changed("split.test", value["test"], change)}
     if key == "auto" and isinstance(value, dict):

@@ -9,6 +9,7 @@ from ccnn_torch.identification.identifiability import (
 )
 from ccnn_torch.identification.problems.constraints import (
     distance_problem as distance_problem,
+    pair_problem as pair_problem,
     plane_problem as plane_problem,
     scatter as scatter,
     socket_problem as socket_problem,

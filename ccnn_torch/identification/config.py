@@ -36,14 +36,28 @@ class FrameConfig(Section):
     tool: bool = Field(default=False, description="identify where the measured target sits on the platform")
 
 
+class BesideConfig(Section):
+    """Rows of another kind that the same machine has to explain."""
+
+    kind: Literal["pose", "sockets", "distances", "plane"] = Field(
+        description="pose (what was measured of the pose, all or a part), or a kind of constraint"
+    )
+    records: Files = Field(description="their file, with the columns of that kind")
+    by: Names | None = Field(default=None, min_length=1, description="as constraint.by")
+    noise: Size | None = Field(
+        default=None, description="standard deviation of one of their equations; null = that of the residuals"
+    )
+
+
 class ConstraintConfig(Section):
     """What holds the tool instead of a measuring device; see `ccnn_torch.identification.problems.constraints`."""
 
-    kind: Literal["sockets", "distances", "plane"] = Field(
+    kind: Literal["sockets", "distances", "plane", "pose"] = Field(
         default="sockets",
         description="sockets (a ball in sockets of a plate; columns x, y, z = the socket's place on the plate), "
-        "distances (from an anchor; column distance) or plane (points on a plane; column reading of a dial gauge, "
-        "or none)",
+        "distances (column distance; from an anchor, or to the place of a second set of joints in columns such as "
+        "q1_b), plane (points on a plane; column reading of a dial gauge, or none) or pose (a part of the pose, in "
+        "the machine's own base)",
     )
     by: Names | None = Field(
         default=None,
@@ -61,6 +75,11 @@ class ConstraintConfig(Section):
     )
     where: dict[str, float] = Field(
         default={}, description="values that a row's columns must have to take part, e.g. {robot: 1}"
+    )
+    beside: list[BesideConfig] = Field(
+        default=[],
+        description="further rows in the same fit, each with kind, records, by and noise, e.g. [{kind: pose, "
+        "records: bed.csv}]",
     )
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.config.sizes import size, sizes_by_name
+from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
@@ -24,6 +25,7 @@ from ccnn_torch.identification import (
     Problem,
     Progress,
     distance_problem,
+    pair_problem,
     plane_problem,
     reweighted,
     scatter,
@@ -32,19 +34,24 @@ from ccnn_torch.identification import (
     tool_points,
     what_is_known,
 )
-from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig
-from ccnn_torch.identification.measured import Kinematics, Measured, Rows, nominal_machine
+from ccnn_torch.identification.config import BesideConfig, ConstraintConfig, IdentifyConfig
+from ccnn_torch.identification.measured import Kinematics, Measured, Rows, nominal_machine, split_records
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
+from ccnn_torch.identification.problems.poses import forward_problem
+from ccnn_torch.identification.problems.problem import joined
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
-from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
-from ccnn_torch.records import Records, Table, stack_columns
+from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm, as_measured
+from ccnn_torch.records import Records, Table, load_records, stack_columns
 from ccnn_torch.records.headers import check_joints
 from ccnn_torch.records.joint_map import read_joint_map, with_joints
 from ccnn_torch.records.load import read_source
 
 GROUPED_BY = {"sockets": "placement", "distances": "anchor", "plane": "plane"}
 """Column that numbers the groups of each kind, unless the config names others."""
+Kind = ConstraintConfig | BesideConfig
+# What the columns of the second place of a distance end with.
+_SECOND = "_b"
 # Joints beyond this are taken for degrees [rad], as in records of poses: 4 turns.
 _ANGLE_LIMIT = 8 * np.pi
 
@@ -61,6 +68,8 @@ class ConstraintRows:
         labels: the meaning of each number: the grouping columns and their values.
         weights: `s` [1]; 1 = row to identify from, 0 = held-out row.
         data_hash: SHA-256 of the records.
+        others: joints of the second place of each row, `s x n` [SI], where distances are between two places.
+        seen: the mechanism as poses `s x p` in `said` show it; None where a constraint holds the tool.
     """
 
     joints: Tensor
@@ -69,11 +78,18 @@ class ConstraintRows:
     labels: dict[float, dict[str, float]]
     weights: Tensor
     data_hash: str
+    others: Tensor | None = None
+    seen: Mechanism | None = None
+
+    @property
+    def in_sockets(self) -> bool:
+        """Whether what is said of a row is its socket's place."""
+        return self.seen is None and self.said.shape[-1] == 3
 
     @property
     def cell(self) -> Tensor:
         """Number of the place that each row's tool is held in, `s`: one socket of one placement, or the group."""
-        keys = torch.cat([self.group[:, None], self.said], dim=-1) if self.said.shape[-1] == 3 else self.group[:, None]
+        keys = torch.cat([self.group[:, None], self.said], dim=-1) if self.in_sockets else self.group[:, None]
         number: Tensor = torch.unique(keys, dim=0, return_inverse=True)[1]
         return number
 
@@ -83,25 +99,44 @@ def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given |
     about = config.constraint
     assert about is not None and config.records is not None
     source = with_test_file(config.records if given is None else given, config.split)
+    if about.kind == "pose":
+        rows, records = _poses_of(config, source, mechanism)
+        weights = torch.zeros(len(records), dtype=torch.float64)
+        weights[split_records(config, records).train] = 1.0
+        return replace(rows, weights=weights)
     if isinstance(source, Records):
         raise InputError("records: a constraint has columns of its own; give the path of its file, or a DataFrame")
     counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
     table = with_joints(read_source(source, config.columns), counted)
-    check_joints(table, mechanism.joints)
     there = _taking_part(table, about.where)
-    joints = torch.from_numpy(stack_columns(table, mechanism.joints, _ANGLE_LIMIT))[there]
-    group, labels = _groups(table, about, there)
-    said = torch.from_numpy(stack_columns(table, _said_columns(table, about)))[there]
-    said = said if said.shape[-1] else torch.zeros(len(joints), 1, dtype=torch.float64)
+    rows = _rows_of(table, mechanism, about, there)
+    joints = rows.joints
     columns = {name: table.raw(name)[there.numpy()] for name in table.names}
     held = rows_of_test_file(config.split, table.parts)
     nowhere = torch.empty(len(joints), 0, dtype=torch.float64)
     train = split_by(config.split, nowhere, columns, config.seed, 0.0, None if held is None else held[there]).train
     weights = torch.zeros(len(joints), dtype=torch.float64)
     weights[train] = 1.0
-    rows = ConstraintRows(joints, said, group, labels, weights, table.data_hash)
+    rows = replace(rows, weights=weights)
     _check_cells(rows, about)
     return rows
+
+
+def _rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> ConstraintRows:
+    """The rows of a table that are numbered, all of weight 1."""
+    check_joints(table, mechanism.joints)
+    joints = torch.from_numpy(stack_columns(table, mechanism.joints, _ANGLE_LIMIT))[there]
+    second = [Coordinate(f"{j.name}{_SECOND}", j.unit) for j in mechanism.joints]
+    paired = about.kind == "distances" and any(c.name in table for c in second)
+    others = torch.from_numpy(stack_columns(table, second, _ANGLE_LIMIT))[there] if paired else None
+    if paired:
+        group, labels = torch.zeros(len(joints), dtype=torch.float64), {0.0: {"pairs": 0.0}}
+    else:
+        group, labels = _groups(table, about, there)
+    said = torch.from_numpy(stack_columns(table, _said_columns(table, about)))[there]
+    said = said if said.shape[-1] else torch.zeros(len(joints), 1, dtype=torch.float64)
+    weights = torch.ones(len(joints), dtype=torch.float64)
+    return ConstraintRows(joints, said, group, labels, weights, table.data_hash, others)
 
 
 def _taking_part(table: Table, where: Mapping[str, float]) -> Tensor:
@@ -117,7 +152,7 @@ def _taking_part(table: Table, where: Mapping[str, float]) -> Tensor:
     return torch.from_numpy(np.flatnonzero(chosen))
 
 
-def _groups(table: Table, about: ConstraintConfig, there: Tensor) -> tuple[Tensor, dict[float, dict[str, float]]]:
+def _groups(table: Table, about: Kind, there: Tensor) -> tuple[Tensor, dict[float, dict[str, float]]]:
     names = about.by or [GROUPED_BY[about.kind]]
     for name in names:
         if name not in table:
@@ -133,7 +168,7 @@ def _groups(table: Table, about: ConstraintConfig, there: Tensor) -> tuple[Tenso
     return torch.from_numpy(number.reshape(-1).astype(np.float64)), labels
 
 
-def _said_columns(table: Table, about: ConstraintConfig) -> list[Coordinate]:
+def _said_columns(table: Table, about: Kind) -> list[Coordinate]:
     if about.kind == "sockets":
         return [Coordinate(axis, "m") for axis in "xyz"]
     if about.kind == "distances":
@@ -149,7 +184,7 @@ def _check_cells(rows: ConstraintRows, about: ConstraintConfig) -> None:
     if len(lost):
         label = rows.labels[float(rows.group[lost[0, 0]])]
         named = ", ".join(f"{name} {value:g}" for name, value in label.items())
-        socket = "a socket of " if about.kind == "sockets" and rows.said.shape[-1] == 3 else ""
+        socket = "a socket of " if rows.in_sockets else ""
         raise InputError(
             f"split: {socket}{named} has held-out rows but none to identify from, so these cannot be judged; write "
             "split.kind=random or a smaller split.test, or measure it more often"
@@ -184,6 +219,7 @@ class ConstraintFit:
         selection: the machine's free parameters, which are the first of the problem's.
         knowledge: of all the problem's parameters.
         fit: the last round's.
+        beside: of rows of other kinds, one each.
     """
 
     before: State
@@ -191,18 +227,39 @@ class ConstraintFit:
     selection: Selection
     knowledge: Knowledge
     fit: Fit
+    beside: list[dict[str, Any]]
+
+
+@dataclass
+class _Source:
+    """Rows of one kind: what makes their problem, and the noise of an equation, as given or of the last round."""
+
+    build: Build
+    noise: float
+    known: bool
+
+    def problem(self, choice: ParameterChoice, start: Tensor) -> Problem:
+        return self.build(choice, start, self.noise)
 
 
 def fit_constraint(
-    config: IdentifyConfig, mechanism: Mechanism, rows: ConstraintRows, progress: Progress | None = None
+    config: IdentifyConfig,
+    mechanism: Mechanism,
+    rows: ConstraintRows,
+    progress: Progress | None = None,
+    others: Sequence[Build] = (),
 ) -> ConstraintFit:
     """Fit the rows that have weight.
 
     Priors keep the links near nominal; the tool's offset, which no maker knows, is fitted first, with nominal links.
     Where the config names no noise, it is that of the residuals, in five rounds; for the intervals it is raised by the
     equations that the fit used up.
+
+    Args:
+        others: of the rows of other kinds, in the order of the config.
     """
-    build = _builder(config, mechanism, rows)
+    assert config.constraint is not None
+    build = _builder(config.constraint, mechanism, rows)
     names = [p.name for p in mechanism.geometry]
     held = [n for n in names if n.startswith(("base_", "tool_r"))]
     about = choice_of(config, mechanism)
@@ -212,30 +269,53 @@ def fit_constraint(
     choice = ParameterChoice(of_machine, (), about.tied, {**_priors(config, mechanism, of_machine), **about.prior})
     before = _tool_first(mechanism, build, tool, choice)
     solver = solver_of("lm", config)
-    known = None if config.noise is None or isinstance(config.noise, dict) else size(config.noise, "m", "noise")
-    if known is not None and not known > 0:
-        raise InputError(f"noise: {known:g} is no standard deviation; write a length above 0, or remove the key")
-    noise, rounds = known or _FIRST_NOISE, 1 if known else _ROUNDS
+    given = [(config.noise, "noise")]
+    given += [(one.noise, f"constraint.beside.{i}.noise") for i, one in enumerate(config.constraint.beside)]
+    sources = [_source(make, noise, key) for make, (noise, key) in zip((build, *others), given, strict=True)]
+    rounds = 1 if all(s.known for s in sources) else _ROUNDS
+    selection = select_parameters(mechanism.geometry, choice, before.geometry)
+    shared = len(selection.parameters)
+    loss = config.robust or "squared"
     for done in range(rounds):
-        problem = build(choice, before.geometry, noise)
-        fit = solver(problem, config.seed)
-        if known is None:
-            noise = _left(problem, fit.values, noise)
+        parts = [s.problem(choice, before.geometry) for s in sources]
+        fit = solver(_all_of(parts, shared), config.seed)
+        values = _values_of(parts, fit.values, shared)
+        for source, part, own in zip(sources, parts, values, strict=True):
+            source.noise = source.noise if source.known else _left(part, own, source.noise)
         if progress is not None:
             progress((done + 1) / rounds)
-    loss = config.robust or "squared"
-    if known is None:
-        problem = build(choice, before.geometry, noise)
-        spared = float(what_is_known(reweighted(problem, fit.values, loss), fit.values).noise)
-        if spared < float("inf"):
-            noise *= max(1.0, spared)
-        problem = build(choice, before.geometry, noise)
-    selection = select_parameters(mechanism.geometry, choice, before.geometry)
-    geometry = selection.full(fit.values[:, : len(selection.parameters)])[0]
-    after = State(geometry, problem, fit.values, noise)
-    return ConstraintFit(
-        before, after, selection, what_is_known(reweighted(problem, fit.values, loss), fit.values), fit
-    )
+    if rounds > 1:
+        parts = [s.problem(choice, before.geometry) for s in sources]
+        whole = _all_of(parts, shared)
+        spared = float(what_is_known(reweighted(whole, fit.values, loss), fit.values).noise)
+        for source in sources:
+            source.noise *= max(1.0, spared) if spared < float("inf") and not source.known else 1.0
+        parts = [s.problem(choice, before.geometry) for s in sources]
+    whole = _all_of(parts, shared)
+    after = State(selection.full(fit.values[:, :shared])[0], parts[0], values[0], sources[0].noise)
+    known = what_is_known(reweighted(whole, fit.values, loss), fit.values)
+    beside = [
+        {"noise": s.noise, "before": _left(p, p.start, s.noise), "after": _left(p, own, s.noise)}
+        for s, p, own in zip(sources[1:], parts[1:], values[1:], strict=True)
+    ]
+    return ConstraintFit(before, after, selection, known, fit, beside)
+
+
+def _source(build: Build, noise: Any, key: str) -> _Source:
+    known = None if noise is None or isinstance(noise, dict) else size(noise, "m", key)
+    if known is not None and not known > 0:
+        raise InputError(f"{key}: {known:g} is no standard deviation; write a length above 0, or remove the key")
+    return _Source(build, known or _FIRST_NOISE, known is not None)
+
+
+def _all_of(parts: Sequence[Problem], shared: int) -> Problem:
+    return parts[0] if len(parts) == 1 else joined(parts, shared)
+
+
+def _values_of(parts: Sequence[Problem], values: Tensor, shared: int) -> list[Tensor]:
+    """Of the values of all `1 x p` those of each part."""
+    ends = list(accumulate((len(p.parameters) - shared for p in parts), initial=shared))
+    return [torch.cat([values[:, :shared], values[:, a:b]], -1) for a, b in pairwise(ends)]
 
 
 def held_distance(mechanism: Mechanism, rows: ConstraintRows, state: State) -> Tensor:
@@ -244,18 +324,17 @@ def held_distance(mechanism: Mechanism, rows: ConstraintRows, state: State) -> T
     In a socket: from the mean of the points that the rows with weight put into the same socket of the same placement,
     which needs no fitted plate. Else |residual| of the distance or height, with the anchor or plane of the fit.
     """
-    if rows.said.shape[-1] == 3:
+    if rows.in_sockets:
         return scatter(tool_points(mechanism, rows.joints, state.geometry), rows.cell, rows.weights)
-    return _residual(state.problem, state.values)[0, :, 0].abs() * state.noise
+    far: Tensor = _residual(state.problem, state.values)[0].norm(dim=-1) * state.noise
+    return far
 
 
-def _builder(config: IdentifyConfig, mechanism: Mechanism, rows: ConstraintRows) -> Build:
-    about = config.constraint
-    assert about is not None
+def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
     if about.kind == "sockets":
         several = len(torch.unique(rows.said, dim=0)) > 1
         plate = _PLATE_TOLERANCE if several else 0.0
-        if about.plate_tolerance is not None:
+        if isinstance(about, ConstraintConfig) and about.plate_tolerance is not None:
             plate = size(about.plate_tolerance, "m", "constraint.plate_tolerance")
 
         def sockets(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
@@ -266,12 +345,53 @@ def _builder(config: IdentifyConfig, mechanism: Mechanism, rows: ConstraintRows)
             )
 
         return sockets
+    seconds, seen = rows.others, rows.seen
+    if seen is not None:
+
+        def poses(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
+            sizes = None if noise is None else sizes_of_pose(noise, seen.pose, "noise")
+            return forward_problem(seen, rows.joints, rows.said, rows.weights, choice, sizes, start=start)
+
+        return poses
+    if seconds is not None:
+
+        def pairs(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
+            return pair_problem(mechanism, rows.joints, seconds, rows.said[:, 0], noise, rows.weights, choice, start)
+
+        return pairs
     make = distance_problem if about.kind == "distances" else plane_problem
 
     def build(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
         return make(mechanism, rows.joints, rows.group, rows.said[:, 0], noise, rows.weights, choice, start)
 
     return build
+
+
+def _beside(config: IdentifyConfig, mechanism: Mechanism) -> tuple[list[Build], list[int]]:
+    """What makes the problem of the rows of each other kind, and how many rows it has."""
+    assert config.constraint is not None
+    found, counts = [], []
+    for about in config.constraint.beside:
+        if about.kind == "pose":
+            rows = _poses_of(config, about.records, mechanism)[0]
+        else:
+            counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
+            table = with_joints(read_source(about.records, config.columns), counted)
+            rows = _rows_of(table, mechanism, about, torch.arange(len(table)))
+        found.append(_builder(about, mechanism, rows))
+        counts.append(len(rows.joints))
+    return found, counts
+
+
+def _poses_of(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[ConstraintRows, Records]:
+    """Rows of poses, or of parts of them, in the machine's own base; all of weight 1."""
+    records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
+    seen = as_measured(mechanism, records.pose_coordinates, records.path)
+    group, weights = torch.zeros(len(records), dtype=torch.float64), torch.ones(len(records), dtype=torch.float64)
+    rows = ConstraintRows(
+        records.joints, records.pose, group, {0.0: {"pose": 0.0}}, weights, records.data_hash, seen=seen
+    )
+    return rows, records
 
 
 def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> dict[str, float]:
@@ -296,8 +416,8 @@ def _tool_first(mechanism: Mechanism, build: Build, tool: list[str], choice: Par
     """The tool's offset with nominal links; where it is fixed, the constraint as its builder finds it at nominal."""
     nominal = mechanism.nominal
     if not tool:
-        problem = build(ParameterChoice(choice.free, choice.fixed, choice.tied), nominal, None)
-        return State(nominal, problem, problem.start, 1.0)
+        problem = build(choice, nominal, _FIRST_NOISE)
+        return State(nominal, problem, problem.start, _FIRST_NOISE)
     alone = ParameterChoice(free=tool)
     problem = build(alone, nominal, None)
     values = solve_lm(problem).values
@@ -332,7 +452,8 @@ def identify_by_constraint(
     mechanism, notes = _machine(config)
     rows = read_constraint(config, mechanism, given)
     begun = time.perf_counter()
-    fit = fit_constraint(config, mechanism, rows, progress)
+    others, counts = _beside(config, mechanism)
+    fit = fit_constraint(config, mechanism, rows, progress, others)
     outcome = Outcome(
         machines=torch.arange(1),
         values=fit.after.geometry[None],
@@ -357,7 +478,7 @@ def identify_by_constraint(
     noise = None if config.noise is None else fit.after.noise
     found = Found(outcome, _known(fit), before, after)
     results, arrays = assemble(config, measured, fit.selection, {"lm": found}, noise, _only_by_prior(fit, found.known))
-    results["constraint"] = _constraint(config, rows, fit)
+    results["constraint"] = _constraint(config, rows, fit, counts)
     return measured, {"lm": outcome}, results, arrays
 
 
@@ -378,7 +499,9 @@ def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
 def _known(fit: ConstraintFit) -> Known:
     """The machine's part of what is known; a parameter that only its prior determines has no interval."""
     knowledge = fit.knowledge
-    determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * fit.after.problem.prior_sd)
+    prior = fit.after.problem.prior_sd
+    prior = torch.nn.functional.pad(prior, (0, knowledge.sd.shape[-1] - len(prior)), value=math.inf)
+    determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * prior)
     noise = knowledge.noise if fit.after.problem.noise_known else torch.ones(1, dtype=torch.float64)
     return known_of(
         [replace(knowledge, sd=torch.where(determined, knowledge.sd, math.inf), noise=noise)], fit.selection
@@ -392,7 +515,7 @@ def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
     return [f"No better known than by the tolerance given: {', '.join(prior)}."] if prior else []
 
 
-def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit) -> dict[str, Any]:
+def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit, counts: list[int]) -> dict[str, Any]:
     """What was found of the constraint itself."""
     assert config.constraint is not None
     k, knowledge = len(fit.selection.parameters), fit.knowledge
@@ -413,4 +536,8 @@ def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit
         "unknowns": unknowns,
         "noise": fit.after.noise,
         "noise_known": config.noise is not None,
+        "beside": [
+            {"kind": about.kind, "records": str(about.records), "rows": count, **found}
+            for about, count, found in zip(config.constraint.beside, counts, fit.beside, strict=True)
+        ],
     }

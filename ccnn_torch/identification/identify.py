@@ -15,7 +15,7 @@ from ccnn_torch.config.split import Given
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Fit, Progress
-from ccnn_torch.identification.config import IdentifyConfig, base_method
+from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig, base_method
 from ccnn_torch.identification.constrained import identify_by_constraint
 from ccnn_torch.identification.identifiability import bootstrap
 from ccnn_torch.identification.judge import map_error, read_elsewhere, transferred
@@ -35,7 +35,7 @@ from ccnn_torch.identification.solve import (
     select,
     solver_of,
 )
-from ccnn_torch.mechanisms import Framed, Mechanism
+from ccnn_torch.mechanisms import Framed, Mechanism, Partial
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
@@ -119,6 +119,11 @@ def identify(
         progress = None if watch is None else watch("lm")
         return Identification(config, *identify_by_constraint(config, progress, given), given=given)
     mechanism, measured = prepare(config, given)
+    if isinstance(measured.mechanism, Partial) and config.methods == ["lm"] and not config.bootstrap:
+        # Parts of poses leave much open: links stay near nominal by priors, as beside any constraint.
+        held = config.model_copy(update={"constraint": ConstraintConfig(kind="pose")})
+        progress = None if watch is None else watch("lm")
+        return Identification(config, *identify_by_constraint(held, progress, given), given=given)
     elsewhere = read_elsewhere(config, mechanism)
     for method in config.methods:  # refuse what cannot be solved before anything takes minutes
         solver_of(method, config)

@@ -20,6 +20,7 @@ _HOLDERS = {
     "sockets": "the other rows of its socket put",
     "distances": "the measured distance puts",
     "plane": "the plane puts",
+    "pose": "the measured part of the pose puts",
 }
 
 

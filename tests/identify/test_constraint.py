@@ -99,13 +99,15 @@ def test_what_rows_of_sockets_cannot_tell_has_no_interval(folder: Path) -> None:
 
 def test_the_machine_is_a_model_for_commands(folder: Path) -> None:
     model = load_compensation(folder / "identified.yaml")
+    machine = model.machine
+    assert machine is not None
     joints = joints_of(DATA)[:5]
     found = model(joints.numpy())
     assert found["inside_domain"].all()
     # Before: links nominal, the tool as it was fitted with them.
-    wanted = tool_points(model.nominal, joints)
-    assert float((tool_points(model.identified, joints) - wanted).norm(dim=-1).min()) > 1e-4
-    reached = tool_points(model.identified, torch.from_numpy(found["command"]))
+    wanted = tool_points(machine.nominal, joints)
+    assert float((tool_points(machine.identified, joints) - wanted).norm(dim=-1).min()) > 1e-4
+    reached = tool_points(machine.identified, torch.from_numpy(found["command"]))
     torch.testing.assert_close(reached, wanted, rtol=0, atol=1e-7)
 
 
@@ -165,7 +167,7 @@ def test_distances_and_planes_identify_too(kind: str, tmp_path: Path) -> None:
     ("changes", "message"),
     [
         (["constraint.by=[plate]"], "constraint.by: .*sockets.csv has no column 'plate', which numbers the placement"),
-        (["constraint.kind=socket"], "constraint.kind: must be 'sockets', 'distances' or 'plane'"),
+        (["constraint.kind=socket"], "constraint.kind: must be 'sockets', 'distances', 'plane' or 'pose'"),
         (["constraint.kind=distances"], "plate_tolerance: a constraint of kind distances has no plate"),
         (["constraint.kind=distances", "constraint.plate_tolerance=null"], "there is no column 'distance'"),
         (["constraint={kind: distances}"], "no column 'anchor', which numbers the anchor of each row"),

@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor
 
 from ccnn_torch.api import identify
-from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.poses import compares_poses
 from ccnn_torch.mechanisms import Mechanism, Partial, load_mechanism
 from ccnn_torch.records import write_table
@@ -70,5 +68,42 @@ def test_the_default_tolerance_fits_machines_without_angles(tmp_path: Path) -> N
     joints = stewart.sample_joints(12, torch.Generator().manual_seed(0))
     columns = {f"q{k + 1}[m]": joints[:, k].numpy() for k in range(6)}
     write_table(tmp_path / "few.csv", columns | {"anchor[1]": 0 * columns["q1[m]"], "distance[m]": columns["q1[m]"]})
-    with pytest.raises(InputError, match="rows of 1 equations cannot determine"):
-        identify(mechanism="stewart", records=str(tmp_path / "few.csv"), constraint={"kind": "distances"})
+    found = identify(mechanism="stewart", records=str(tmp_path / "few.csv"), constraint={"kind": "distances"})
+    assert found.results["constraint"]["kind"] == "distances"
+
+
+def _marks(machine: Mechanism, truth: Tensor, seed: int) -> tuple[Tensor, Tensor]:
+    """Joints that the controller sends to marks on the bed, and where the true machine then is."""
+    joints = machine.solve_inverse(_bed(8, seed))
+    return joints, machine.forward_kinematics(joints, truth)
+
+
+def test_heights_and_distances_in_one_fit_make_the_bed_flat_and_parts_of_the_right_size(tmp_path: Path) -> None:
+    """Forty heights of the bed and eight distances between places that the machine printed itself."""
+    nominal, truth = _printer()
+    generator = torch.Generator().manual_seed(5)
+    probed = nominal.solve_inverse(_bed(40, 2), truth)
+    (one, here), (two, there) = _marks(nominal, truth, 3), _marks(nominal, truth, 4)
+    noise = torch.randn(48, generator=generator, dtype=torch.float64)
+    heights = {f"q{k + 1}[m]": probed[:, k].numpy() for k in range(3)} | {"z[m]": 1e-5 * noise[:40].numpy()}
+    pairs = {f"q{k + 1}{end}[m]": q[:, k].numpy() for end, q in (("", one), ("_b", two)) for k in range(3)}
+    pairs["distance[m]"] = ((here - there).norm(dim=-1) + 2e-5 * noise[40:]).numpy()
+    write_table(tmp_path / "bed.csv", heights)
+    write_table(tmp_path / "marks.csv", pairs)
+    keys = {"records": str(tmp_path / "marks.csv"), "mechanism": "delta_linear", "mechanism_keys": KEYS}
+    beside = [{"kind": "pose", "records": str(tmp_path / "bed.csv"), "noise": "10 um"}]
+    constraint = {"kind": "distances", "tolerance": {"m": "1 mm", "rad": "5 mrad"}, "beside": beside}
+    found = identify(**keys, noise="20 um", split={"test": 0.2}, constraint=constraint)
+    block = found.results["constraint"]["beside"][0]
+    assert (block["kind"], block["rows"]) == ("pose", 40) and block["after"] < 1.5e-5 < 1e-4 < block["before"]
+    elsewhere = _bed(60, 9)
+
+    def made(machine: Mechanism) -> tuple[float, float]:
+        """Spread of the heights, and RMS of what distances are off by, where this machine's commands lead."""
+        reached = nominal.forward_kinematics(machine.solve_inverse(elsewhere), truth)
+        apart, wanted = ((p[:30] - p[30:]).norm(dim=-1) for p in (reached, elsewhere))
+        return float(reached[:, 2].std()), float((apart - wanted).square().mean().sqrt())
+
+    before, after = made(nominal), made(found.mechanism())
+    assert after[0] < 1e-5 < 3e-5 < before[0]
+    assert after[1] < 6e-5 < 1.2e-4 < before[1], (before, after)

@@ -1,4 +1,4 @@
-"""Constraints instead of poses: a ball in sockets of a plate, distances from an anchor, points on a plane.
+"""Constraints instead of poses: a ball in sockets of a plate, distances, points on a plane.
 
 Each builder gives a `Problem` in the free parameters of the machine and in what is unknown of the constraint itself,
 which the same fit finds: the place of a plate, an anchor, a plane. Neither needs a measuring device. What such rows
@@ -146,6 +146,40 @@ def distance_problem(
     return machine.problem(gap, (joints, distance[:, None], columns), unknown, ("distance",))
 
 
+def pair_problem(
+    mechanism: Mechanism,
+    joints: Tensor,
+    others: Tensor,
+    distance: Tensor,
+    noise: float | None = None,
+    weights: Tensor | None = None,
+    choice: ParameterChoice | None = None,
+    start: Tensor | None = None,
+) -> Problem:
+    """Measured distance of two places that the machine reached itself (scale bar, tape between holes, printed part).
+
+    Args:
+        others: joints of the second place of each row, `s x n` [SI].
+        distance: `s` [m].
+        joints, noise, weights, choice, start: as `socket_problem`.
+
+    Returns:
+        Problem with the parameters chosen.
+
+    Raises:
+        InputError: as `socket_problem`.
+    """
+    machine = _machine(mechanism, joints, weights, choice, start, noise)
+    _machine(mechanism, others, weights, choice, start, noise)
+
+    def gap(full: Tensor, unknown: Tensor, q: Tensor, there: Tensor, d: Tensor) -> Tensor:
+        apart = tool_points(mechanism, q, full) - tool_points(mechanism, there, full)
+        length: Tensor = torch.linalg.vector_norm(apart, dim=-1, keepdim=True)
+        return length - d
+
+    return machine.problem(gap, (joints, others, distance[:, None]), [], ("distance",))
+
+
 def plane_problem(
     mechanism: Mechanism,
     joints: Tensor,
@@ -275,7 +309,8 @@ class _Machine:
             return gap(full, values[..., k:], *rows) / unit
 
         machines = len(self.weights)
-        others = torch.tensor([[u.start, u.scale, u.prior_sd] for u in unknown], dtype=torch.float64).mT
+        stated = [[u.start, u.scale, u.prior_sd] for u in unknown]
+        others = torch.tensor(stated, dtype=torch.float64).reshape(-1, 3).mT
         problem = Problem(
             parameters=(*selection.parameters, *(Parameter(u.name, u.unit, u.start) for u in unknown)),
             start=torch.cat([selection.start[0], others[0]]).expand(machines, -1).clone(),

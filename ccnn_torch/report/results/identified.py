@@ -124,14 +124,27 @@ class Unknown(Result):
     unit: str
 
 
+class Beside(Result):
+    kind: Literal["pose", "sockets", "distances", "plane"]
+    records: str
+    rows: int
+    noise: float
+    """standard deviation of one equation: given, or that of the residuals"""
+    before: float
+    """RMS of what an equation is off by, links nominal"""
+    after: float
+
+
 class Constraint(Result):
-    kind: Literal["sockets", "distances", "plane"]
+    kind: Literal["sockets", "distances", "plane", "pose"]
     placements: list[Placement]
     unknowns: dict[str, Unknown]
     """where plates, anchors or planes stand"""
     noise: float
     """standard deviation of one equation [m]: given, or that of the residuals"""
     noise_known: bool
+    beside: list[Beside] = []
+    """rows of other kinds in the same fit; none of them is held out"""
 
 
 class Transfer(Result):
