@@ -39,7 +39,9 @@ def gap_plot(results: Block) -> Plot | None:
     grid = figure.subplots(len(shown), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (name, block) in zip(grid, shown, strict=True):
         scale, unit = display_unit(block["unit"], block["before"])
-        _draw_bars(axes, bars[name], scale, unit)
+        reach = max(max(value, ends[1] if ends else 0.0) for _, value, ends, _ in bars[name]) / scale
+        _draw_bars(axes, bars[name], reach, scale, unit)
+        axes.set_xlim(0, 1.16 * reach)
         floor = block["noise_floor"]
         if floor is not None:
             label = f"{floor_words(results)} {number_text(floor / scale, 3)} {unit}"
@@ -92,21 +94,20 @@ def _ends(before: float, floor: float, interval: list[float] | None) -> tuple[fl
     return low, high
 
 
-def _draw_bars(axes: Axes, bars: list[Bar], scale: float, unit: str) -> None:
-    reach = max(max(value, ends[1] if ends else 0.0) for _, value, ends, _ in bars) / scale
+def _draw_bars(axes: Axes, bars: list[Bar], reach: float, scale: float = 1.0, unit: str = "") -> None:
+    """Bars with their sizes beside them, in a unit of that scale [SI], or of probabilities; reach: of the longest."""
     for i, (_, value, ends, colour) in enumerate(bars):
-        size = value / scale
+        right = size = value / scale
         axes.barh(i, size, height=0.62, color=colour)
-        right = size
         if ends is not None:
             # A shrink is never below 0, but an effect that is not there makes the gap larger on rows it has not seen.
             left, right = min(ends[0] / scale, size), max(ends[1] / scale, size)
             axes.hlines(i, left, right, color="#222222", linewidth=1.3)
             axes.vlines([left, right], i - 0.13, i + 0.13, color="#222222", linewidth=1.3)
-        axes.text(right + 0.012 * reach, i, f"{number_text(size, 3)} {unit}", va="center", fontsize=9)
+        text = f"{number_text(size, 3)} {unit}" if unit else probability_words(size)
+        axes.text(right + 0.012 * reach, i, text, va="center", fontsize=9)
     axes.set_yticks(range(len(bars)), [bar[0] for bar in bars])
     axes.set_ylim(len(bars) - 0.4, -0.6)
-    axes.set_xlim(0, 1.16 * reach)
     axes.grid(axis="y", visible=False)
 
 
@@ -121,30 +122,26 @@ def probability_plot(results: Block) -> Plot | None:
     verdict = results["verdict"]
     names = set(verdict["effects"])
     like = {n for e in results["effects"] if e["name"] in names for n in e["indistinguishable_from"]} - names
-    bars = []
+    probability = verdict["probability"]
+    bars: list[Bar] = []
     if verdict["none"]:
-        bars.append(("none: noise only", verdict["probability"], AFTER))
+        bars.append(("none: noise only", probability, None, AFTER))
     if verdict["outside_library"]:
-        bars.append((f"outside the library:\n{driver_words(verdict['driver'])}", verdict["probability"], BEFORE))
+        bars.append((f"outside the library:\n{driver_words(verdict['driver'])}", probability, None, BEFORE))
     listed = {e["name"] for e in results["effects"]}
-    bars += [(name, verdict["probability"], AFTER) for name in verdict["effects"] if name not in listed]
+    bars += [(name, probability, None, AFTER) for name in verdict["effects"] if name not in listed]
     for e in results["effects"]:
         if len(bars) < _DRAWN and (e["name"] in names | like or e["probability"] >= _LEAST):
             colour = AFTER if e["name"] in names else _LIKE if e["name"] in like else GREY
-            bars.append((e["name"], e["probability"], colour))
+            bars.append((e["name"], e["probability"], None, colour))
     if not bars:
         return None
     figure = Figure(figsize=(8.4, 0.34 * len(bars) + 1.0), layout="tight")
     axes = figure.subplots()
-    for i, (_, probability, colour) in enumerate(bars):
-        axes.barh(i, probability, height=0.62, color=colour)
-        axes.text(probability + 0.012, i, probability_words(probability), va="center", fontsize=9)
-    axes.set_yticks(range(len(bars)), [bar[0] for bar in bars])
-    axes.set_ylim(len(bars) - 0.4, -0.6)
+    _draw_bars(axes, bars, 1.0)
     axes.set_xlim(0, 1.14)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1.0])
     axes.set_xlabel("probability [1]")
-    axes.grid(axis="y", visible=False)
     hidden = len(listed) - sum(bar[0] in listed for bar in bars)
     caption = "How probable each explanation is after seeing these rows: dark blue, in the verdict"
     caption += "; light blue, not distinguished from one in the verdict by these rows" if like else ""
