@@ -78,7 +78,8 @@ def test_failure_is_a_value_with_a_sentence():
     start = torch.tensor([[1.0], [-1.0], [2.0]], dtype=torch.float64)
     found = levenberg_marquardt(torch.log, start)
     assert found.converged.tolist() == [True, False, True]
-    assert found.message == "1 of 3 problems failed; the first (index 1) has a residual that is not finite at its start"
+    why = "has a residual that is not finite at its start"
+    assert found.message == f"1 of 3 problems failed; the first, number 2, {why}"
     assert found.value[1] == -1.0
     hurried = levenberg_marquardt(_rosenbrock, torch.tensor([-1.2, 1.0], dtype=torch.float64), max_iterations=2)
     assert not hurried.converged and "did not settle in 2 steps" in hurried.message

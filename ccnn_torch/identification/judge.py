@@ -53,12 +53,15 @@ def figure_text(block: Mapping[str, Any] | None, key: str, scale: float = 1.0, d
     return text
 
 
-def before_and_after(before: PoseError, after: PoseError, noise: PoseError | None = None) -> dict[str, Any]:
+def before_and_after(
+    before: PoseError, after: PoseError, noise: PoseError | None = None, removed: bool = False
+) -> dict[str, Any]:
     """Position and rotation: RMS and maximum over the poses of a machine, before and after.
 
     Args:
         before, after: `r x t`.
         noise: of the measurement, `r x t`, where it is known.
+        removed: whether the share of the RMS that was removed is of interest.
     """
     answer: dict[str, Any] = {}
     for name, unit, first, last, floor in zip(
@@ -75,20 +78,9 @@ def before_and_after(before: PoseError, after: PoseError, noise: PoseError | Non
         }
         if floor is not None:
             entries["noise"] = _rms(floor)
+        if removed:
+            entries["removed"] = 1 - _rms(last) / _rms(first)
         answer[name] = {"unit": unit} | figures(entries)
-    return answer
-
-
-def removed(before: PoseError, after: PoseError) -> dict[str, Any]:
-    """As `before_and_after`, with the share of the RMS that was removed."""
-    answer = before_and_after(before, after)
-    for name, first, last in zip(PoseError._fields, before, after, strict=True):
-        if answer[name] is None or first is None or last is None:
-            continue
-        share = figures({"removed": 1 - _rms(last) / _rms(first)})
-        answer[name]["removed"] = share["removed"]
-        if "spread" in share:
-            answer[name]["spread"] |= share["spread"]
     return answer
 
 
@@ -259,5 +251,5 @@ def transferred(config: IdentifyConfig, elsewhere: Elsewhere, values: Tensor) ->
     return {
         "records": "/".join(Path(str(config.transfer)).parts[-2:]),
         "rows": {"train": train.joints.shape[1], "test": test.joints.shape[1]},
-        "test": before_and_after(*errors),
+        "test": before_and_after(errors[0], errors[1]),
     }

@@ -21,7 +21,6 @@ from ccnn_torch.identification.judge import (
     map_error,
     noise_of_test,
     predicted,
-    removed,
 )
 from ccnn_torch.identification.measured import Measured
 from ccnn_torch.identification.problems.parameters import Selection
@@ -232,7 +231,9 @@ def beside_truth(
         block["coverage"] = float(inside.double().mean())
     sent = commanded(measured, outcome.values, machines)
     if sent is not None:
-        block["compensation"] = {name: removed(sent.before, getattr(sent, name)) for name in ("exact", "linear")}
+        block["compensation"] = {
+            name: before_and_after(sent.before, getattr(sent, name), removed=True) for name in ("exact", "linear")
+        }
     arrays = {f"deviation_{method}": gap, f"bound_{method}": bound}
     error = map_error(measured, outcome.values, machines)
     return block, arrays if error is None else arrays | {f"map_{method}": error}

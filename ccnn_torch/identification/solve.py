@@ -211,24 +211,15 @@ def save_outcome(path: Path, outcome: Outcome, facts: Mapping[str, Any]) -> None
     Raises:
         WriteError: it cannot be written.
     """
-    about = {
-        "facts": dict(facts),
-        "evaluations": outcome.evaluations,
-        "seconds": outcome.seconds,
-        "message": outcome.message,
-    }
-    tensors = {"machines": outcome.machines, "values": outcome.values, "converged": outcome.converged}
-    save_checkpoint(path, tensors, about)
+    parts = vars(outcome)
+    tensors = {name: part for name, part in parts.items() if isinstance(part, Tensor)}
+    about = {name: part for name, part in parts.items() if name not in tensors}
+    save_checkpoint(path, tensors, about | {"facts": dict(facts)})
 
 
 def load_outcome(path: Path) -> Outcome:
     """The outcome in a file."""
     tensors, about = load_checkpoint(path)
-    return Outcome(
-        tensors["machines"],
-        tensors["values"],
-        tensors["converged"].to(torch.bool),
-        int(about["evaluations"]),
-        float(about["seconds"]),
-        str(about["message"]),
-    )
+    parts: dict[str, Any] = {**about, **tensors}
+    del parts["facts"]
+    return Outcome(**parts)

@@ -17,7 +17,7 @@ from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.settings import check_least
 from ccnn_torch.learners.gaussian_process import GPNetwork, covariance, log_evidence, spread_factor
 from ccnn_torch.learners.protocol import TrainingData
-from ccnn_torch.learners.rows import usable_rows
+from ccnn_torch.learners.rows import taken, usable_rows
 from ccnn_torch.numerics.blocks import block_size
 
 # Numbers in one matrix worked on at a time: what fits into the processor's cache is several times faster than one
@@ -116,9 +116,8 @@ class GaussianProcess:
         o = data.targets.shape[-1]
         self._shape = r, o
         order = self._order(data)
-        across = torch.arange(r, device=order.device).unsqueeze(-1)
-        self._weights = data.weights[across, order]
-        self._rows, self._targets = data.inputs[across, order], data.targets[across, order].mT.contiguous()
+        rows = taken(data, order)
+        self._weights, self._rows, self._targets = rows.weights, rows.inputs, rows.targets.mT.contiguous()
         shares = (data.weights / data.weights.sum(1, keepdim=True)).unsqueeze(-1)
         self._mean = (data.targets * shares).sum(1)
         self._variance = ((data.targets - self._mean.unsqueeze(1)).square() * shares).sum(1)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.settings import check_least
-from ccnn_torch.learners.grnn_network import FARTHEST, GRNNNetwork, KernelVariance, blocked_means
+from ccnn_torch.learners.grnn_network import FARTHEST, GRNNNetwork, KernelMeans, KernelVariance, blocked_means
 from ccnn_torch.learners.protocol import TrainingData, weighted_mse
-from ccnn_torch.learners.rows import usable_rows
+from ccnn_torch.learners.rows import taken, usable_rows
 
 # Streams of random numbers: which rows are judged, and the moves of each step.
 _ROWS, _MOVES = 0, 1
@@ -63,24 +62,6 @@ class GRNNSettings:
             raise ValueError(f"move={self.move} is a factor: write a number above 1")
 
 
-class _Judged(NamedTuple):
-    """The rows of leave-one-out, the judged ones (queries) first; `r x n ...`."""
-
-    inputs: Tensor
-    targets: Tensor
-    weights: Tensor
-    metric: Tensor | None
-    queries: int
-
-    @property
-    def log_weights(self) -> Tensor:
-        return self.weights.log()
-
-    @property
-    def own(self) -> Tensor:
-        return torch.arange(self.queries, device=self.inputs.device)
-
-
 class GRNN:
     """Kernel regression with one bandwidth per input, shared by the outputs; a step judges a batch of bandwidths.
 
@@ -110,7 +91,11 @@ class GRNN:
         """
         rows = usable_rows(data)
         self._data, self._seeds = rows, data.seeds
-        self._judged = self._draw_rows(rows)
+        # Rows in an order drawn by seed, padded ones last, as many as are used; the judged ones (queries) first.
+        count = rows.weights.shape[1]
+        keys = uniform(self._seeds, _ROWS, 0, (count,)) + (rows.weights == 0)
+        self._judged = taken(rows, keys.argsort(-1)[:, : self.settings.references])
+        self._own = torch.arange(min(self.settings.queries, count), device=keys.device)
         repeats, width = len(data.seeds), data.inputs.shape[-1]
         self._inverse = rows.inputs.new_zeros(repeats, width)
         self._move = rows.inputs.new_full((repeats,), self.settings.move)
@@ -205,17 +190,6 @@ class GRNN:
     def _move_count(self) -> int:
         return max(self.settings.candidates, 3 * self._inverse.shape[-1])
 
-    def _draw_rows(self, rows: TrainingData) -> _Judged:
-        """Rows in an order drawn by seed, padded ones last, as many as are used."""
-        count = rows.weights.shape[1]
-        keys = uniform(self._seeds, _ROWS, 0, (count,)) + (rows.weights == 0)
-        order = keys.argsort(-1)[:, : self.settings.references]
-        repeats = torch.arange(len(order), device=order.device).unsqueeze(-1)
-        inputs, targets, weights = (part[repeats, order] for part in (rows.inputs, rows.targets, rows.weights))
-        queries = min(self.settings.queries, order.shape[1])
-        metric = None if rows.metric is None else rows.metric[repeats, order[:, :queries]]
-        return _Judged(inputs, targets, weights, metric, queries)
-
     def _grid(self) -> Tensor:
         """One bandwidth for all inputs, `r x c x i` (1 / h)."""
         settings = self.settings
@@ -249,19 +223,23 @@ class GRNN:
 
     def _squares(self, inverse: Tensor) -> Tensor:
         """Squared leave-one-out error of every judged row. inverse: `r x c x i`; returns `r x c x q`."""
-        judged = self._judged
-        count = judged.queries
-        means = blocked_means(
-            judged.inputs[:, :count], judged.inputs, judged.log_weights, judged.targets, inverse, judged.own
-        ).mean
+        judged, count = self._judged, len(self._own)
+        means = self._left_out(slice(None), inverse).mean
         error = means - judged.targets[:, None, :count]
         if judged.metric is not None:
-            error = (judged.metric.unsqueeze(1) @ error.unsqueeze(-1)).squeeze(-1)
+            error = (judged.metric[:, None, :count] @ error.unsqueeze(-1)).squeeze(-1)
         return error.square().mean(-1)
+
+    def _left_out(self, repeats: slice, inverse: Tensor) -> KernelMeans:
+        """Means at the judged rows without the row itself. inverse: 1 / h, `r x c x i`."""
+        judged = self._judged
+        rows, count = judged.inputs[repeats], len(self._own)
+        logarithms = judged.weights[repeats].log()
+        return blocked_means(rows[:, :count], rows, logarithms, judged.targets[repeats], inverse, self._own)
 
     def _mean_of_rows(self, values: Tensor) -> Tensor:
         """Weighted mean over the judged rows. values: `r x ... x q`; returns `r x ...`."""
-        weights = self._judged.weights[:, : self._judged.queries]
+        weights = self._judged.weights[:, : len(self._own)]
         shares = weights / weights.sum(-1, keepdim=True)
         return (values * shares.view(len(shares), *[1] * (values.dim() - 2), -1)).sum(-1)
 
@@ -270,7 +248,7 @@ class GRNN:
         gain = self._of_mean[:, 0] - squares
         mean = self._mean_of_rows(gain)
         variance = self._mean_of_rows((gain - mean.unsqueeze(-1)).square())
-        count = self._judged.weights[:, : self._judged.queries].sum(-1)
+        count = self._judged.weights[:, : len(self._own)].sum(-1)
         return mean > _CAUTION * (variance / count).sqrt()
 
     def _training_error(self) -> Tensor:
@@ -278,7 +256,7 @@ class GRNN:
         judged, rows = self._judged, self._data
         if rows.weights.shape[1] <= self.settings.references:
             return weighted_mse(self.predict(rows.inputs), rows.targets, rows.weights)
-        here = slice(0, judged.queries)
+        here = slice(0, len(self._own))
         return weighted_mse(self.predict(judged.inputs[:, here]), judged.targets[:, here], judged.weights[:, here])
 
     def _narrowed(self, inverse: Tensor) -> Tensor:
@@ -290,18 +268,11 @@ class GRNN:
     def _residuals(self, repeat: int) -> KernelVariance:
         """What the leave-one-out residuals of one repeat show of the noise."""
         judged = self._judged
-        count = judged.queries
+        count = len(self._own)
         there = judged.weights[repeat] > 0
         queried = there[:count]
         one = slice(repeat, repeat + 1)
-        found = blocked_means(
-            judged.inputs[one, :count],
-            judged.inputs[one],
-            judged.log_weights[one],
-            judged.targets[one],
-            self._model()[one].unsqueeze(1),
-            judged.own,
-        )
+        found = self._left_out(one, self._model()[one].unsqueeze(1))
         residual = (found.mean[0, 0] - judged.targets[repeat, :count])[queried]
         # A residual holds the error of the mean it is taken from as well.
         squares = residual.square() / (1 + found.squares[0, 0, queried].unsqueeze(-1))

@@ -12,6 +12,7 @@ from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.evolution.masked_network import MaskedNetwork, Spread, readout_spread, spread_variance
 from ccnn_torch.evolution.network import forward
 from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.numerics.trees import mapped
 
 
 def usable_rows(data: TrainingData) -> TrainingData:
@@ -38,11 +39,14 @@ def thinned(data: TrainingData, most: int) -> TrainingData:
     place = torch.arange(most, device=count.device).expand(len(count), -1)
     # Rows that count first, in their order.
     order = (~there).to(torch.int8).sort(dim=1, stable=True).indices
-    index = order.gather(1, torch.where(count > most, place * count // most, place))
+    return taken(data, order.gather(1, torch.where(count > most, place * count // most, place)))
+
+
+def taken(data: TrainingData, index: Tensor) -> TrainingData:
+    """The rows with these numbers, `r x n` int64; validation rows stay."""
     repeat = torch.arange(len(index), device=index.device).unsqueeze(1)
-    inputs, targets, weights = (part[repeat, index] for part in (data.inputs, data.targets, data.weights))
-    metric = None if data.metric is None else data.metric[repeat, index]
-    return replace(data, inputs=inputs, targets=targets, weights=weights, metric=metric)
+    rows = mapped(lambda part: part[repeat, index], (data.inputs, data.targets, data.weights, data.metric))
+    return replace(data, inputs=rows[0], targets=rows[1], weights=rows[2], metric=rows[3])
 
 
 class OneNetwork(ABC):

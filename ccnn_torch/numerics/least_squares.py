@@ -241,7 +241,7 @@ def levenberg_marquardt(
 
     found = descend(evaluate, _least_squares_step, settled, begin, damping=damping, max_iterations=max_iterations)
     converged, cost = found.converged.reshape(lead), found.cost.reshape(lead)
-    message = _message(converged, cost, max_iterations)
+    message = failures(converged, cost, max_iterations)
     return Solution(found.value.reshape(start.shape), cost, found.iterations, converged, message)
 
 
@@ -273,7 +273,8 @@ def _least_squares_step(r: Tensor, j: Tensor, lam: Tensor) -> tuple[Tensor, Tens
     return step, (step * (ridge[..., None] * step - gradient)).sum(-1) / 2
 
 
-def _message(converged: Tensor, cost: Tensor, max_iterations: int) -> str:
+def failures(converged: Tensor, cost: Tensor, max_iterations: int, what: str = "problems") -> str:
+    """One sentence on how many of a descent did not converge and why the first did not; empty where all did."""
     failed = torch.nonzero(~converged)
     if len(failed) == 0:
         return ""
@@ -281,5 +282,5 @@ def _message(converged: Tensor, cost: Tensor, max_iterations: int) -> str:
     why = f"did not settle in {max_iterations} steps"
     if not bool(torch.isfinite(cost[first])):
         why = "has a residual that is not finite at its start"
-    where = f" (index {', '.join(map(str, first))})" if first else ""
-    return f"{len(failed)} of {converged.numel()} problems failed; the first{where} {why}"
+    where = f", number {', '.join(str(i + 1) for i in first)}," if first else ""
+    return f"{len(failed)} of {converged.numel()} {what} failed; the first{where} {why}"

@@ -12,10 +12,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.identification.problems.parameters import ParameterChoice, select_parameters
+from ccnn_torch.identification.problems.parameters import ParameterChoice, Selection, select_parameters
 from ccnn_torch.identification.problems.problem import Problem
 from ccnn_torch.identification.problems.whitened import (
     Geometry,
+    MeasuredRows,
     check_finite,
     covariance,
     gather_rows,
@@ -69,13 +70,10 @@ def inverse_problem(
             that is singular, a prior without noise, fewer equations than parameters, or a choice that does not fit the
             mechanism.
     """
-    rows = gather_rows(mechanism, joints, pose, weights, start)
-    whole = (mechanism.nominal if start is None else start.detach()).reshape(-1, len(mechanism.nominal))
-    selection = select_parameters(mechanism.geometry, choice, whole)
+    rows, whole, selection, geometry = _begun(mechanism, joints, pose, weights, choice, start)
     names = [j.name for j in mechanism.joints]
     turn = 2 * math.pi * torch.tensor([j.unit == "rad" for j in mechanism.joints], dtype=torch.float64)
     turn = turn.to(rows.joints.device)
-    geometry = Geometry(selection, rows.joints.shape[1])
 
     def gap(values: Tensor, x: Tensor, q: Tensor, *fixed: Tensor) -> Tensor:
         difference = mechanism.solve_inverse(x, geometry(values, *fixed), q) - q
@@ -107,6 +105,21 @@ def inverse_problem(
 
 
 _TURN = ("rx", "ry", "rz")
+
+
+def _begun(
+    mechanism: Mechanism,
+    joints: Tensor,
+    pose: Tensor,
+    weights: Tensor | None,
+    choice: ParameterChoice | None,
+    start: Tensor | None,
+) -> tuple[MeasuredRows, Tensor, Selection, Geometry]:
+    """Rows, geometry at the start `r x K` [SI], the free parameters, and the way from them to the geometry."""
+    rows = gather_rows(mechanism, joints, pose, weights, start)
+    whole = (mechanism.nominal if start is None else start.detach()).reshape(-1, len(mechanism.nominal))
+    selection = select_parameters(mechanism.geometry, choice, whole)
+    return rows, whole, selection, Geometry(selection, rows.joints.shape[1])
 
 
 def compares_poses(mechanism: Mechanism) -> bool:
@@ -150,15 +163,12 @@ def forward_problem(
     Raises:
         InputError: as `inverse_problem`.
     """
-    rows = gather_rows(mechanism, joints, pose, weights, start)
-    whole = (mechanism.nominal if start is None else start.detach()).reshape(-1, len(mechanism.nominal))
-    selection = select_parameters(mechanism.geometry, choice, whole)
+    rows, whole, selection, geometry = _begun(mechanism, joints, pose, weights, choice, start)
     names = [c.name for c in mechanism.pose]
     angles = torch.tensor([c.unit == "rad" for c in mechanism.pose], device=rows.pose.device)
     turning = [names.index(a) for a in _TURN] if set(_TURN) <= set(names) else []
     rest = [i for i in range(len(names)) if i not in turning]
     order = [*rest, *turning]
-    geometry = Geometry(selection, rows.joints.shape[1])
     turns = (rotation_vector_to_matrix(rows.pose[..., turning]).flatten(-2),) if turning else ()
 
     def difference(full: Tensor, q: Tensor, x: Tensor, *measured: Tensor) -> Tensor:

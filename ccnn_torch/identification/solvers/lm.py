@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.problem import OPEN, Fit, Problem, Progress, WeightedRows
-from ccnn_torch.numerics.least_squares import Trial, damped_step, descend
+from ccnn_torch.numerics.least_squares import Trial, damped_step, descend, failures
 from ccnn_torch.numerics.outliers import chi_quantile, residual_scale
 
 LOSSES = ("squared", "huber", "cauchy")
@@ -127,7 +127,7 @@ def solve_lm(
             progress(float(block[-1] + 1) / machines)
     settled = torch.cat(converged)
     total = torch.cat(cost)
-    return Fit(values, total, settled, count, _failed_machines(settled, total, max_iterations))
+    return Fit(values, total, settled, count, failures(settled, total, max_iterations, "machines"))
 
 
 def _starts(rows: WeightedRows, starts: int, seed: int) -> Tensor:
@@ -235,14 +235,3 @@ def _seen_step(matrix: Tensor, gradient: Tensor, damping: Tensor, unseen: Tensor
     part = torch.where(values > torch.maximum(unseen[..., None], 1e-14 * largest), -along / curvature, 0.0)
     step = (vectors @ part[..., None])[..., 0]
     return step, (part * ((curvature - values) * part - along)).sum(-1) / 2
-
-
-def _failed_machines(converged: Tensor, cost: Tensor, max_iterations: int) -> str:
-    failed = torch.nonzero(~converged).squeeze(-1)
-    if not len(failed):
-        return ""
-    first = int(failed[0])
-    why = f"did not settle in {max_iterations} steps"
-    if not bool(torch.isfinite(cost[first])):
-        why = "has a residual that is not finite at its start"
-    return f"{len(failed)} of {len(converged)} machines failed; the first, number {first + 1}, {why}"
