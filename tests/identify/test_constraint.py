@@ -99,13 +99,14 @@ def test_what_rows_of_sockets_cannot_tell_has_no_interval(folder: Path) -> None:
 
 def test_the_machine_is_a_model_for_commands(folder: Path) -> None:
     model = load_compensation(folder / "identified.yaml")
+    assert model.machine is not None
     joints = joints_of(DATA)[:5]
     found = model(joints.numpy())
     assert found["inside_domain"].all()
     # Before: links nominal, the tool as it was fitted with them.
-    wanted = tool_points(model.nominal, joints)
-    assert float((tool_points(model.identified, joints) - wanted).norm(dim=-1).min()) > 1e-4
-    reached = tool_points(model.identified, torch.from_numpy(found["command"]))
+    wanted = tool_points(model.machine.nominal, joints)
+    assert float((tool_points(model.machine.identified, joints) - wanted).norm(dim=-1).min()) > 1e-4
+    reached = tool_points(model.machine.identified, torch.from_numpy(found["command"]))
     torch.testing.assert_close(reached, wanted, rtol=0, atol=1e-7)
 
 
