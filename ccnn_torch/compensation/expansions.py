@@ -21,6 +21,9 @@ _AIM, _WORST = 1e-6, 1e-2
 _SPREAD = 250
 # Keeps coefficients that the points do not determine (corners that no pose reaches) small.
 _RIDGE = 1e-12
+_MOST_JOINTS = 7
+# Tolerance, as a share of the largest value, with which a function of this form is reproduced at other joints.
+_EXACT = 1e-9
 
 
 class ChebyshevExpansion(nn.Module):
@@ -165,11 +168,6 @@ def _exponents(joints: int, degree: int) -> Tensor:
     for _ in range(joints):
         rows = [(*row, k) for row in rows for k in range(degree + 1 - sum(row))]
     return torch.tensor(rows, dtype=torch.int64)
-
-
-_MOST_JOINTS = 7
-# Tolerance, as a share of the largest value, with which a function of this form is reproduced at other joints.
-_EXACT = 1e-9
 
 
 class TrigonometricExpansion(nn.Module):

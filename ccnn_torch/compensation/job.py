@@ -35,6 +35,9 @@ _CLOSE = 1e-8
 _STARTS = 64
 # Joints all over the measured region, among which the first row's guess is looked for.
 _LOOKED_AT = 2000
+_LARGEST = 500_000_000
+ROWS = 1024
+"""Rows that a model takes at once: its calls count for nothing then, and it takes a hundred MB."""
 
 
 class WantedPoses:
@@ -205,10 +208,6 @@ def _reached(mechanism: Mechanism, joints: Tensor, poses: Tensor) -> Tensor:
 
 
 Array: TypeAlias = NDArray[Any]
-
-_LARGEST = 500_000_000
-ROWS = 1024
-"""Rows that a model takes at once: its calls count for nothing then, and it takes a hundred MB."""
 
 
 @dataclass

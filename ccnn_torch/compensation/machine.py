@@ -30,6 +30,9 @@ SETTLED = 1e-9
 ASTRAY = 1e-3
 # Joints beyond it are none: what their sines and cosines are differs from library to library [m or rad].
 FARTHEST = 1e3
+_MOST_NEWTON = 8
+# Error of the polynomial from which Newton's method comes to the right pose, as a share of the largest.
+_START = 0.1
 
 
 class Rule(NamedTuple):
@@ -222,11 +225,6 @@ def limits_of(mechanism: Mechanism) -> tuple[Tensor, Tensor]:
     # Exactly a full turn is what a joint without limits is sampled over.
     free = (mechanism.limits.abs() == math.pi).all(-1)
     return torch.where(free, -none, mechanism.limits[:, 0]), torch.where(free, none, mechanism.limits[:, 1])
-
-
-_MOST_NEWTON = 8
-# Error of the polynomial from which Newton's method comes to the right pose, as a share of the largest.
-_START = 0.1
 
 
 class InverseMachine(Machine):

@@ -23,6 +23,9 @@ from ccnn_torch.training import Scaling
 
 # How much larger than at the rows what effects take from the kinematics may become.
 _ABOVE = 1.1
+ROWS = 2500
+"""Rows that show where the machine is used."""
+_FEWEST = 100
 
 
 def machine_parts(
@@ -74,11 +77,6 @@ def _care(rows: Situation) -> Care:
     care = Care(ROTATION_WEIGHT, 0.0)
     gain, inverse_gain = (_ABOVE * float(sizes.max()) for sizes in gains(rows.jacobian, care))
     return care._replace(gain=gain, inverse_gain=inverse_gain)
-
-
-ROWS = 2500
-"""Rows that show where the machine is used."""
-_FEWEST = 100
 
 
 def all_over(nominal: Mechanism) -> Situation:

@@ -301,13 +301,14 @@ def test_identified_geometry_alone(error: float, tmp_path: Path) -> None:
     lines = [f"  {p.name}: {{value: {v + error!r}, nominal: {v!r}, unit: {json.dumps(p.unit)}}}" for p, v in rows]
     path.write_text("\n".join(["mechanism: five_bar", "keys: {}", "parameters:", *lines]))
     model = load_geometry(path)
+    assert model.compensator is not None and model.machine is not None
     domain = model.compensator.domain
     draw = torch.rand(50, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     joints = domain.centre + 0.5 * domain.half_range * (2 * draw - 1)
     found = model(joints.numpy())
     exact = found["status"] == 0
     assert exact.sum() > 20
-    wanted, real = bar.forward_kinematics(joints), model.identified.forward_kinematics
+    wanted, real = bar.forward_kinematics(joints), model.machine.identified.forward_kinematics
     reached = real(torch.from_numpy(found["command"]))
     assert float((reached - wanted)[exact].abs().max()) < 1e-9
     files = export_model(path, "c99", tmp_path / "out")

@@ -44,6 +44,16 @@ RUN_ERRORS: tuple[type[Exception], ...] = (
     *(RuntimeError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError, MemoryError),
     *(v for v in vars(runtime).values() if isinstance(v, type) and issubclass(v, Exception)),
 )
+_FORMATS = "ccnn_torch compensator "
+OPTIONAL = ("secant", "geometry", "effects", "machine")
+"""Keys of parts that not every model has."""
+_REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
+_PACKAGES = ("torch", "onnx", "onnxruntime", "safetensors", "numpy")
+# No model that can be solved for needs as many; a forged one may not compute for ever.
+_MOST_ITERATIONS = 10_000
+_MOST_TERMS = 100
+# Nor has an effect of the library as many numbers on any machine.
+_MOST_NUMBERS = 10_000
 
 
 def said(reason: Exception) -> str:
@@ -98,19 +108,8 @@ def run_onnx(session: onnxruntime.InferenceSession, joints: Array, covariates: A
     return dict(zip(names, session.run(names, feeds), strict=True))
 
 
-_FORMATS = "ccnn_torch compensator "
 FORMAT = f"{_FORMATS}6"
-OPTIONAL = ("secant", "geometry", "effects", "machine")
-"""Keys of parts that not every model has."""
-_REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
-_PACKAGES = ("torch", "onnx", "onnxruntime", "safetensors", "numpy")
 
-
-# No model that can be solved for needs as many; a forged one may not compute for ever.
-_MOST_ITERATIONS = 10_000
-_MOST_TERMS = 100
-# Nor has an effect of the library as many numbers on any machine.
-_MOST_NUMBERS = 10_000
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Size = Annotated[float, Field(allow_inf_nan=False, ge=0)]

@@ -25,6 +25,10 @@ from ccnn_torch.mechanisms.mechanism_file import dh_text, mjcf_text, urdf_text
 from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
 
+DTYPES = ("float64", "float32")
+# What a controller needs: without the way back and the standard deviation a graph takes three quarters of the time.
+COMMAND = ("command", "deviation", "inside_domain", "status")
+
 
 def print_robot(model: LoadedModel) -> dict[str, str]:
     """Contents of the files by name: `robot.urdf`, `robot.xml` (MJCF), and `robot.yaml` where the arm has a DH table.
@@ -54,11 +58,6 @@ def _arm(model: LoadedModel) -> SerialArm:
     arm = machine.real
     assert isinstance(arm, SerialArm)
     return arm
-
-
-DTYPES = ("float64", "float32")
-# What a controller needs: without the way back and the standard deviation a graph takes three quarters of the time.
-COMMAND = ("command", "deviation", "inside_domain", "status")
 
 
 @dataclass

@@ -33,6 +33,8 @@ _MOVES = frozenset({
     "roll", "slice_scatter", "select_scatter",
 })  # fmt: skip
 _ASKS = frozenset({"lt", "le", "gt", "ge", "eq", "ne", "isnan", "isfinite", "isinf", "where"})
+# From here a number counts as infinite where single precision has no 1e300.
+_HUGE_SINGLE = 3e38
 
 
 class Value:
@@ -158,8 +160,6 @@ class _ByElements(Lowering):
 
 # As in the check of every other model file: what is left of command + deviation = joints, as a share of the limit.
 _SLACK = {"float64": 1e-6, "float32": SINGLE_TOLERANCE}
-# From here a number counts as infinite where single precision has no 1e300.
-_HUGE_SINGLE = 3e38
 
 
 def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) -> Form:

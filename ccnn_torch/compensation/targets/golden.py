@@ -18,6 +18,13 @@ from ccnn_torch.errors import MethodFailedError
 
 # Near a singular pose rounding grows: what is allowed there, in units of what is allowed elsewhere.
 DAMPED_TOLERANCE = 1e3
+# Outputs of the way back, as a form's user calls them.
+_BACK = {"joints": "ideal", "status": "ideal_status"}
+_RANDOM = 1000
+# Corners of the domain are as many as 2 to the power of its inputs; of more inputs than these the middle is taken.
+_CORNERS = 6
+# How far beside an edge a vector is, in units of the half range: rounding must not decide on which side.
+_BESIDE = {"float64": 1e-9, "float32": 1e-3}
 
 
 @dataclass(frozen=True)
@@ -83,8 +90,6 @@ def probe_points(compensator: Compensator, count: int = 256) -> tuple[Tensor, Te
 
 # Numbers at a time: a loop over a large table holds all its products of every row.
 _AT_ONCE = 1 << 18
-# Outputs of the way back, as a form's user calls them.
-_BACK = {"joints": "ideal", "status": "ideal_status"}
 
 
 def run_program(program: Program, inputs: dict[str, Array], dtype: str = "float64") -> dict[str, Array]:
@@ -173,13 +178,6 @@ def run_routine(form: Form, name: str, joints: Array, covariates: Array) -> dict
 
     execute(routine.statements, values, call, zeros)
     return {key: values[key] for key in routine.returns} | {"status": values["status"][:, 0].astype(int)}
-
-
-_RANDOM = 1000
-# Corners of the domain are as many as 2 to the power of its inputs; of more inputs than these the middle is taken.
-_CORNERS = 6
-# How far beside an edge a vector is, in units of the half range: rounding must not decide on which side.
-_BESIDE = {"float64": 1e-9, "float32": 1e-3}
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,11 @@ from ccnn_torch.errors import MethodFailedError
 
 # Rows of an example, or a few more.
 _LEAST = 61
+_OPSET = 20
+_OPSET_FLOAT32 = 17
+# Of the correction limit: what a network may ask for.
+_LOOSEST = 1e-9
+_OUTPUTS_FLOAT32 = ("deviation", "guard", "back_deviation", "back_guard")
 
 
 def rows_apart_from(module: torch.nn.Module) -> int:
@@ -124,13 +129,6 @@ def command_graph(
     model = graph.model({name: found[name] for name in outputs}, batch, "compensator")
     model.metadata_props.add(key=METADATA_KEY, value=metadata)
     return model
-
-
-_OPSET = 20
-_OPSET_FLOAT32 = 17
-# Of the correction limit: what a network may ask for.
-_LOOSEST = 1e-9
-_OUTPUTS_FLOAT32 = ("deviation", "guard", "back_deviation", "back_guard")
 
 
 def export_onnx(compensator: Compensator, metadata: str, outputs: Sequence[str] = OUTPUTS) -> bytes:

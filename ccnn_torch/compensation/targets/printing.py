@@ -19,27 +19,6 @@ from ccnn_torch.errors import MethodFailedError
 
 if TYPE_CHECKING:
     from jinja2 import Environment
-
-
-def filled(template: str, **values: Any) -> str:
-    """A file's text; a name in the template that no value has is an error."""
-    return _environment().get_template(template).render(**values)
-
-
-@cache
-def _environment() -> Environment:
-    # Loaded with the package by everybody who compensates, and needed by who exports alone.
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    return Environment(
-        loader=PackageLoader("ccnn_torch.compensation.targets"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-
-
 # What is used once is written where it is used, up to so many characters.
 _LONGEST = 90
 # What is written alike everywhere.
@@ -61,6 +40,25 @@ _COUNTED = {
     "exponentials and logarithms": ("exp", "log", "tanh", "pow"),
     "sines and cosines": ("sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
 }
+
+
+def filled(template: str, **values: Any) -> str:
+    """A file's text; a name in the template that no value has is an error."""
+    return _environment().get_template(template).render(**values)
+
+
+@cache
+def _environment() -> Environment:
+    # Loaded with the package by everybody who compensates, and needed by who exports alone.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    return Environment(
+        loader=PackageLoader("ccnn_torch.compensation.targets"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
 
 
 @dataclass(frozen=True)
