@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.marginal_likelihood import (
+    NARROW,
     NO_COLUMNS,
     Grams,
     GroupProducts,
@@ -21,8 +22,6 @@ from ccnn_torch.evidence.marginal_likelihood import (
     scaled,
 )
 
-# Columns from which their products with all others are worth a call of their own.
-_NARROW = 128
 CERTAIN = 100.0
 """Weight of a noise that is certain, in multiples of the values."""
 
@@ -251,7 +250,7 @@ def _grams(
         begin = 0
         for k, end in enumerate(ends):
             # Thin products take as long as wide ones: narrow kinds go together, for all that they have among them.
-            if end - begin < _NARROW and end < width and ends[k + 1] - end < _NARROW:
+            if end - begin < NARROW and end < width and ends[k + 1] - end < NARROW:
                 continue
             after = end if begin == (0, *ends)[k] else begin
             xx[begin:end, after:] = flat[:, begin:end].mT @ flat[:, after:]

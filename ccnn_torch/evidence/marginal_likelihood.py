@@ -18,8 +18,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-# Columns up to which XᵀX is made as a whole.
-_NARROW = 128
+NARROW = 128
+"""Columns up to which XᵀX is made as a whole."""
 # MacKay updates.
 _UPDATES = 8
 JITTER = 1e-13
@@ -94,7 +94,7 @@ def scaled(grams: Grams, variance: float) -> Grams:
 def _squares(flat: Tensor) -> Tensor:
     """XᵀX, `P x P`; of many columns the half above the diagonal, mirrored."""
     width = flat.shape[-1]
-    if width <= _NARROW:
+    if width <= NARROW:
         return flat.mT @ flat
     first, second = flat[:, : width // 2], flat[:, width // 2 :]
     across = first.mT @ second
