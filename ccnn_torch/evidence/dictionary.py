@@ -18,6 +18,7 @@ from ccnn_torch.evidence.marginal_likelihood import (
     GroupProducts,
     Prior,
     fit_single_groups,
+    groups_of,
     own_products,
     scaled,
 )
@@ -224,8 +225,7 @@ def dictionary_of(
     kinds = [*([i for i in library if atoms[i].name == name] for name in names), [*others]]
     chosen = [i for kind in kinds for i in kind]
     columns = torch.cat([y[..., None][..., :0], *(x[i] for i in chosen)], -1)
-    ends = torch.tensor([x[i].shape[-1] for i in chosen], dtype=torch.int64).cumsum(0).tolist()
-    groups = {i: torch.arange(e - x[i].shape[-1], e) for i, e in zip(chosen, ends, strict=True)}
+    groups = dict(zip(chosen, groups_of(x[i] for i in chosen), strict=True))
     grams = _grams(columns, y, kinds, groups, singles, firsts)
     own = {i: singles.axes[i] for i in groups}
     return Dictionary(

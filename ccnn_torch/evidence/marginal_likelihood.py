@@ -12,7 +12,7 @@ groups that are alone need no matrix at all, and of a set its widest group is le
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -84,6 +84,12 @@ def grams_of(x: Tensor, y: Tensor) -> Grams:
     """x: `s x c x P` whitened columns; y: `s x c`."""
     flat, value = x.flatten(0, 1), y.reshape(-1)
     return Grams(_squares(flat), flat.mT @ value, value @ value, float(len(value)))
+
+
+def groups_of(columns: Iterable[Tensor]) -> list[Tensor]:
+    """Groups of columns `... x m` that stand side by side, as indices of the columns."""
+    widths = [c.shape[-1] for c in columns]
+    return [*torch.split(torch.arange(sum(widths)), widths)] if widths else []
 
 
 def scaled(grams: Grams, variance: float) -> Grams:

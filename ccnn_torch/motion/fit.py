@@ -281,16 +281,18 @@ def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: 
     return found
 
 
-def weighed(grams: Grams, sets: Sequence[Sequence[Tensor]], columns: int, variance: float) -> Fits:
-    """Sets under a noise that is known.
+def weighed(grams: Grams, sets: Sequence[Sequence[Tensor]], columns: int, variance: float | None) -> Fits:
+    """Sets under a noise that is known, or that each leaves.
 
     Args:
         grams: of the columns, and after them of those by which the nominal values may be off, coefficients of standard
             deviation 1: they add to the noise.
         sets: of groups of columns.
         columns: how many are fitted.
-        variance: of the noise.
+        variance: of the noise; None = what each set leaves, nominal values being exact.
     """
+    if variance is None:
+        return fit_sets(grams, sets, 0.0)
     g = scaled(grams, variance)
     across = torch.cat([g.xx[columns:, :columns], g.xy[columns:, None]], -1)
     inner = g.xx[columns:, columns:] + torch.eye(len(across), dtype=across.dtype)

@@ -88,17 +88,16 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     by_members = {f.members: f for f in fits}
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
-    sets = [Candidate((essential(f.members, left, unseen), None), f.grams, f.spec.groups, prior_of(f)) for f in fits]
+    sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f)) for f in fits]
     sets += with_drivers(found, axis, drivers, by_members)
     levels = []
     for level in LEVELS:
         weights = _weights(sets, fits[0].noise, level * found.form[axis], level * OF_SMOOTH)
-        named = [(frozenset(one.key[0]), () if one.key[1] is None else (one.key[1],)) for one in sets]
-        weighed_sets = [(*name, w, one) for name, w, one in zip(named, weights, sets, strict=True)]
-        levels.append((1 / len(LEVELS), weighed_sets))
+        named = [(frozenset(one.members), one.drivers, w, one) for w, one in zip(weights, sets, strict=True)]
+        levels.append((1 / len(LEVELS), named))
     explanations = posterior(levels)
     verdict = judge(explanations, explanations, of_classes=True)
-    best, hidden = by_members[verdict.chosen.best.key[0]], None
+    best, hidden = by_members[verdict.chosen.best.members], None
     probability = verdict.probability
     if verdict.outside and not holds(problem, verdict.chosen.best):
         probability = min(probability, _UNCONFIRMED)
@@ -145,12 +144,14 @@ class Candidate(NamedTuple):
     """A set of effects, with a driver or without, as it is weighed.
 
     Attributes:
-        key: members that do something, and the driver.
+        members: those that do something.
+        drivers: what a term beside them follows; () = there is none, or it does next to nothing.
         grams, groups, log_prior: of its model linearised.
         rows: with a driver, whitened columns of members and driver, `m x v` each, and what they explain, `v`.
     """
 
-    key: tuple[Members, str | None]
+    members: Members
+    drivers: tuple[str, ...]
     grams: Grams
     groups: list[Tensor]
     log_prior: float
@@ -214,12 +215,10 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
             rest = left_plain - (mean[: len(flat)] - theta[flat]) @ own_plain - mean[len(flat) : len(x)] @ beside
             taken[k][base.members] = float(rest.square().sum())
             gained = float(left_plain.square().sum()) - taken[k][base.members]
-            there = driver.name if gained >= slight else None
-            sets.append((k, Candidate((base.members, there), grams, groups, prior, (own, columns, y))))
+            there = (driver.name,) if gained >= slight else ()
+            sets.append((k, Candidate(base.members, there, grams, groups, prior, (own, columns, y))))
     # Beside a driver a name has to do what the driver does not do as well.
-    return [
-        one._replace(key=(essential(one.key[0], taken[k] if one.key[1] else left, {}), one.key[1])) for k, one in sets
-    ]
+    return [one._replace(members=essential(one.members, taken[k] if one.drivers else left, {})) for k, one in sets]
 
 
 def holds(problem: Problem, candidate: Candidate) -> bool:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.marginal_likelihood import fit_sets
 from ccnn_torch.evidence.priors import EFFECT, crowd
 from ccnn_torch.motion.fit import fit_many, form_errors, products, sensitivities, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
@@ -125,9 +124,8 @@ class _Pool:
         key = (axis, fit.members, self.variance[axis])
         old = self.scores.get(key)
         if old is None or old[0] is not fit:
-            evidence = float(
-                weighed(fit.grams, [fit.spec.groups], len(fit.spec.flat), self.variance[axis]).log_evidence[0]
-            )
+            weighed_fit = weighed(fit.grams, [fit.spec.groups], len(fit.spec.flat), self.variance[axis])
+            evidence = float(weighed_fit.log_evidence[0])
             old = self.scores[key] = fit, evidence + log_posterior(fit) - fit.log_evidence
         return old[1]
 
@@ -246,8 +244,5 @@ def promise(
         [*base.spec.groups, torch.arange(int(end) - len(v.active), int(end))]
         for v, end in zip(variants, ends, strict=True)
     ]
-    if variance is None:
-        scores = fit_sets(grams, sets, 0.0).log_evidence.tolist()
-    else:
-        scores = weighed(grams, sets, len(x), variance).log_evidence.tolist()
+    scores = weighed(grams, sets, len(x), variance).log_evidence.tolist()
     return [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, variants, strict=True)]

@@ -17,7 +17,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.residual.whitening import ROUNDING
 from ccnn_torch.diagnosis.verdict.blocks import Blocks
-from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of, groups_of
 from ccnn_torch.evidence.shrink import FOLDS, HeldOut
 
 
@@ -39,8 +39,7 @@ def by_block(made: Blocks) -> dict[str, Any] | None:
     if not members or not bool(torch.bincount(number, minlength=FOLDS).all()):
         return None
     columns = torch.cat([white(atoms[i].columns) for i in members], -1)[keep]
-    widths = [atoms[i].columns.shape[-1] for i in members]
-    groups = torch.split(torch.arange(sum(widths)), widths)
+    groups = groups_of(atoms[i].columns for i in members)
     nominal, target = white(made.residual)[keep], white(analysis.residual)[keep]
     before, left, uncertain = nominal.clone(), target.clone(), torch.zeros_like(target)
     for k in range(FOLDS):
