@@ -203,14 +203,10 @@ def fit_in_axes(square: Tensor, along: Tensor, there: Tensor, yy: Tensor, prior:
         there: False for a group of no columns, `b`.
         yy: sum of the squares to be explained, 0-dim, or of each group, `b`.
         prior: of all.
-
-    Returns:
-        `energy` and `log_scale` of `b`.
     """
     none = square[..., None][..., :0]
     parts = _Parts(square, along, none, none[:, :0], square[:, :0], none[:, :0])
-    fits = _most_probable(parts, there[:, None], yy, prior, _UPDATES)
-    return fits._replace(energy=fits.energy[:, 0], log_scale=fits.log_scale[:, 0])
+    return _most_probable(parts, there[:, None], yy, prior, _UPDATES)
 
 
 def column_indices(begin: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
@@ -366,7 +362,7 @@ def fit_single_groups(groups: Sequence[GroupProducts], yy: Tensor, prior: Prior)
         yy, prior: as for `fit_in_axes`.
 
     Returns:
-        as of `fit_in_axes`; and the principal axes of each, `m x m`.
+        the fits, and the principal axes of each, `m x m`.
     """
     axes = axes_of([g.xx for g in groups], yy)
     along = axes.turned([g.xy for g in groups])

@@ -82,7 +82,7 @@ def fitted_whitening(
         if float(gain[best]) < _SLIGHT:
             break
         chosen.append(likely[best])
-        log_scale = torch.cat([log_scale, fits.log_scale[None, 1 + best : 2 + best]], -1)
+        log_scale = torch.cat([log_scale, fits.log_scale[1 + best : 2 + best]], -1)
     return renewed(white, left, y, free, usable)
 
 
