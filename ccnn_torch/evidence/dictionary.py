@@ -12,17 +12,19 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.marginal_likelihood import (
+    NARROW,
     NO_COLUMNS,
+    Fits,
     Grams,
     GroupProducts,
     Prior,
     fit_single_groups,
+    groups_of,
     own_products,
     scaled,
 )
+from ccnn_torch.evidence.priors import crowd
 
-# Columns from which their products with all others are worth a call of their own.
-_NARROW = 128
 CERTAIN = 100.0
 """Weight of a noise that is certain, in multiples of the values."""
 
@@ -156,27 +158,47 @@ def _alone(
 ) -> tuple[dict[tuple[int, ...], FittedSet], dict[int, Tensor]]:
     """No atom, and each alone of those whose products are given; the principal axes of each."""
     fits, axes = fit_single_groups([NO_COLUMNS, *products.values()], yy, Prior(values, noise_dof))
-    numbers = zip(
-        [None, *products],
-        *(v.tolist() for v in (fits.log_evidence, fits.log_scale, fits.energy, fits.rss, fits.noise, fits.effective)),
-        strict=True,
-    )
-    found: dict[tuple[int, ...], FittedSet] = {}
-    for k, (atom, evidence, log_scale, energy, rss, noise, effective) in enumerate(numbers):
-        members = () if atom is None else (atom,)
-        found[members] = FittedSet(
-            members=members,
-            log_posterior=evidence + sum(atoms[i].log_prior for i in members),
-            log_evidence=evidence,
-            along=tuple(fits.first[k, : len(axes[k])] for _ in members),
-            axes=tuple(axes[k] for _ in members),
-            log_scale=(log_scale,)[: len(members)],
-            energy=(energy,)[: len(members)],
+    sets, own = [(), *((i,) for i in products)], dict(zip(products, axes[1:], strict=True))
+    return fitted_sets(sets, sets, fits, own, atoms), own
+
+
+def fitted_sets(
+    sets: Sequence[tuple[int, ...]],
+    ordered: Sequence[Sequence[int]],
+    fits: Fits,
+    axes: Mapping[int, Tensor],
+    atoms: Sequence[Candidate],
+) -> dict[tuple[int, ...], FittedSet]:
+    """Sets by their members.
+
+    Args:
+        sets: members of each, ascending.
+        ordered: the same in the order of the fits, which have the first in their `first`.
+        fits: of the sets.
+        axes: principal axes of each atom.
+        atoms: candidates.
+    """
+    evidence = torch.where(torch.isfinite(fits.log_evidence), fits.log_evidence, -torch.inf)
+    tables = (evidence, fits.log_scale, fits.energy, fits.rss, fits.noise, fits.effective)
+    rows = zip(sets, ordered, fits.first, fits.mean, *(v.tolist() for v in tables), strict=True)
+    found = {}
+    for own, order, first, rest, log_evidence, log_scale, energy, rss, noise, effective in rows:
+        widths = [len(axes[i]) for i in order]
+        along = [*(first[:w] for w in widths[:1]), *torch.split(rest[: sum(widths[1:])], widths[1:])]
+        place = [order.index(i) for i in own]
+        found[own] = FittedSet(
+            members=own,
+            log_posterior=log_evidence + sum(atoms[i].log_prior for i in own) + crowd(len(own)),
+            log_evidence=log_evidence,
+            along=tuple(along[k] for k in place),
+            axes=tuple(axes[i] for i in own),
+            log_scale=tuple(log_scale[k] for k in place),
+            energy=tuple(energy[k] for k in place),
             rss=rss,
             noise=noise,
             effective=effective,
         )
-    return found, dict(zip(products, axes[1:], strict=True))
+    return found
 
 
 def with_noise(dictionary: Dictionary, variance: float) -> Dictionary:
@@ -225,8 +247,7 @@ def dictionary_of(
     kinds = [*([i for i in library if atoms[i].name == name] for name in names), [*others]]
     chosen = [i for kind in kinds for i in kind]
     columns = torch.cat([y[..., None][..., :0], *(x[i] for i in chosen)], -1)
-    ends = torch.tensor([x[i].shape[-1] for i in chosen], dtype=torch.int64).cumsum(0).tolist()
-    groups = {i: torch.arange(e - x[i].shape[-1], e) for i, e in zip(chosen, ends, strict=True)}
+    groups = dict(zip(chosen, groups_of(x[i] for i in chosen), strict=True))
     grams = _grams(columns, y, kinds, groups, singles, firsts)
     own = {i: singles.axes[i] for i in groups}
     return Dictionary(
@@ -251,7 +272,7 @@ def _grams(
         begin = 0
         for k, end in enumerate(ends):
             # Thin products take as long as wide ones: narrow kinds go together, for all that they have among them.
-            if end - begin < _NARROW and end < width and ends[k + 1] - end < _NARROW:
+            if end - begin < NARROW and end < width and ends[k + 1] - end < NARROW:
                 continue
             after = end if begin == (0, *ends)[k] else begin
             xx[begin:end, after:] = flat[:, begin:end].mT @ flat[:, after:]

@@ -12,14 +12,14 @@ groups that are alone need no matrix at all, and of a set its widest group is le
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-# Columns up to which XᵀX is made as a whole.
-_NARROW = 128
+NARROW = 128
+"""Columns up to which XᵀX is made as a whole."""
 # MacKay updates.
 _UPDATES = 8
 JITTER = 1e-13
@@ -86,6 +86,12 @@ def grams_of(x: Tensor, y: Tensor) -> Grams:
     return Grams(_squares(flat), flat.mT @ value, value @ value, float(len(value)))
 
 
+def groups_of(columns: Iterable[Tensor]) -> list[Tensor]:
+    """Groups of columns `... x m` that stand side by side, as indices of the columns."""
+    widths = [c.shape[-1] for c in columns]
+    return [*torch.split(torch.arange(sum(widths)), widths)] if widths else []
+
+
 def scaled(grams: Grams, variance: float) -> Grams:
     """In units of a variance."""
     return Grams(grams.xx / variance, grams.xy / variance, grams.yy / variance, grams.values)
@@ -94,7 +100,7 @@ def scaled(grams: Grams, variance: float) -> Grams:
 def _squares(flat: Tensor) -> Tensor:
     """XᵀX, `P x P`; of many columns the half above the diagonal, mirrored."""
     width = flat.shape[-1]
-    if width <= _NARROW:
+    if width <= NARROW:
         return flat.mT @ flat
     first, second = flat[:, : width // 2], flat[:, width // 2 :]
     across = first.mT @ second
@@ -197,14 +203,10 @@ def fit_in_axes(square: Tensor, along: Tensor, there: Tensor, yy: Tensor, prior:
         there: False for a group of no columns, `b`.
         yy: sum of the squares to be explained, 0-dim, or of each group, `b`.
         prior: of all.
-
-    Returns:
-        `energy` and `log_scale` of `b`.
     """
     none = square[..., None][..., :0]
     parts = _Parts(square, along, none, none[:, :0], square[:, :0], none[:, :0])
-    fits = _most_probable(parts, there[:, None], yy, prior, _UPDATES)
-    return fits._replace(energy=fits.energy[:, 0], log_scale=fits.log_scale[:, 0])
+    return _most_probable(parts, there[:, None], yy, prior, _UPDATES)
 
 
 def column_indices(begin: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
@@ -360,7 +362,7 @@ def fit_single_groups(groups: Sequence[GroupProducts], yy: Tensor, prior: Prior)
         yy, prior: as for `fit_in_axes`.
 
     Returns:
-        as of `fit_in_axes`; and the principal axes of each, `m x m`.
+        the fits, and the principal axes of each, `m x m`.
     """
     axes = axes_of([g.xx for g in groups], yy)
     along = axes.turned([g.xy for g in groups])

@@ -8,6 +8,8 @@ EFFECT = math.log(0.1)
 """Log prior odds of one library effect: one machine in ten has a given one."""
 OUTSIDE = math.log(1e-3)
 """Log prior odds of a discrepancy term: a hundred times rarer than a library effect."""
+WIDE = 10.0
+"""Plausible sizes that what is not judged may have (standard deviation): it takes what it can explain."""
 _CROWD = math.log(0.1)
 
 

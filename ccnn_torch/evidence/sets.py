@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, fitted_sets
 from ccnn_torch.evidence.marginal_likelihood import (
     JITTER,
     Fits,
@@ -115,7 +115,8 @@ def _fitted(
         for lot in _lots(dictionary, kept.members):
             mine = kept.some(lot)
             fits = _updated(dictionary, mine, _UPDATES - _SHORT)
-            found |= _read(dictionary, [sets[k] for k in mine.number.tolist()], mine.members, fits)
+            own = [sets[k] for k in mine.number.tolist()]
+            found |= fitted_sets(own, mine.members.tolist(), fits, dictionary.axes, dictionary.atoms)
     return found
 
 
@@ -192,41 +193,6 @@ def _log_prior(dictionary: Dictionary, members: Tensor) -> Tensor:
     return dictionary.log_prior[members].sum(-1) + crowd(members.shape[1])
 
 
-def _read(
-    dictionary: Dictionary, sets: Sequence[tuple[int, ...]], members: Tensor, fits: Fits
-) -> dict[tuple[int, ...], FittedSet]:
-    """members: of the sets, the widest first, `b x g`."""
-    found = {}
-    evidence = torch.where(torch.isfinite(fits.log_evidence), fits.log_evidence, -torch.inf)
-    posterior = evidence + _log_prior(dictionary, members)
-    numbers = zip(*(v.tolist() for v in (posterior, evidence, fits.rss, fits.noise, fits.effective)), strict=True)
-    tables = (members, dictionary.widths[members], fits.energy, fits.log_scale)
-    rows = zip(sets, *(v.tolist() for v in tables), numbers, strict=True)
-    for row, (
-        own,
-        ordered,
-        widths,
-        energy,
-        log_scale,
-        (log_posterior, log_evidence, rss, noise, effective),
-    ) in enumerate(rows):
-        along = fits.first[row, : widths[0]], *torch.split(fits.mean[row, : sum(widths[1:])], widths[1:])
-        place = [ordered.index(i) for i in own]
-        found[own] = FittedSet(
-            members=own,
-            log_posterior=log_posterior,
-            log_evidence=log_evidence,
-            along=tuple(along[k] for k in place),
-            axes=tuple(dictionary.axes[i] for i in own),
-            log_scale=tuple(log_scale[k] for k in place),
-            energy=tuple(energy[k] for k in place),
-            rss=rss,
-            noise=noise,
-            effective=effective,
-        )
-    return found
-
-
 def added_scale(dictionary: Dictionary, before: Sequence[FittedSet], more: Sequence[int]) -> Tensor:
     """log α² of each of the atoms `more` beside the set `before` it, of one member at least, `b`.
 
@@ -248,7 +214,9 @@ def added_scale(dictionary: Dictionary, before: Sequence[FittedSet], more: Seque
             place = torch.tensor(each)[:, None], own[rows]
             square[rows], along[rows], yy[rows] = squares[place], products[place], left[place[0][:, 0]]
     prior = Prior(turned.values, dictionary.noise_dof)
-    return fit_in_axes(square.clamp_min(0), along, dictionary.widths[atoms[:, 0]] > 0, yy.clamp_min(0), prior).log_scale
+    return fit_in_axes(
+        square.clamp_min(0), along, dictionary.widths[atoms[:, 0]] > 0, yy.clamp_min(0), prior
+    ).log_scale[:, 0]
 
 
 def _batches(

@@ -16,6 +16,8 @@ INTERVAL = (_TAIL / 2, 1 - _TAIL / 2)
 """Quantiles of a 95 % interval."""
 RUNS = 50
 """Rows are dealt and drawn in runs: so many in all, as neighbouring rows may share their errors."""
+FOLDS = 5
+"""Parts of the rows that are held out in turn."""
 # Reducible residual of a bootstrap sample, at least, as a share of that of all rows.
 _LEAST_GAP = 1e-3
 

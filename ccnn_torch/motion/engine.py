@@ -20,8 +20,7 @@ from ccnn_torch.effects.words import words_of
 from ccnn_torch.evidence.shrink import INTERVAL, Draws, Gap, draws
 from ccnn_torch.motion.effects import Facts, Number, motion_effects
 from ccnn_torch.motion.effects.bodies import STANDARD_GRAVITY
-from ccnn_torch.motion.fit import ALONE
-from ccnn_torch.motion.form import deviations
+from ccnn_torch.motion.fit import ALONE, deviations
 from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes
 from ccnn_torch.motion.library import Library
@@ -133,10 +132,10 @@ _TINY = 1e-9
 
 
 def _floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -> float:
-    """Mean square of what the best sets leave, or the richest fit where it leaves less, summed over the axes."""
+    """Mean square of what the best sets leave, or the largest model where it leaves less, summed over the axes."""
     judged = problem.data.judged
     left = problem.residual(torch.stack([v.best.spec.theta for v in verdicts]), problem.axes)
-    each = torch.stack([left[:, judged].square().mean(-1), found.rich[:, judged].square().mean(-1)])
+    each = torch.stack([left[:, judged].square().mean(-1), found.largest[:, judged].square().mean(-1)])
     return float(each.amin(0).sum())
 
 

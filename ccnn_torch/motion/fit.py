@@ -1,4 +1,5 @@
-"""Fits of many sets of effects side by side: Gauss-Newton steps, then the evidence of the model linearised there."""
+"""Fits of many sets of effects side by side: Gauss-Newton steps, then the evidence of the model linearised there; and
+noise with the form errors of effects and of the nominal model in it, under which sets are weighed again."""
 
 from __future__ import annotations
 
@@ -8,15 +9,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.marginal_likelihood import Fits, fit_sets, grams_of
+from ccnn_torch.evidence.dictionary import CERTAIN
+from ccnn_torch.evidence.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_variance
+from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of, scaled
+from ccnn_torch.evidence.priors import WIDE
+from ccnn_torch.motion.effects import EXACT
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.spec import Fit, Spec
 from ccnn_torch.motion.whiten import Whitening
 
 # Of a difference quotient, in plausible sizes.
 _STEP = 1e-3
-# Standard deviation of the numbers in plausible sizes while they are fitted; the evidence has scales of its own.
-_WIDE = 10.0
 _STEPS = 6
 # Shares of a Gauss-Newton step that are tried, and what a step is damped by.
 _SHARES = (1.0, 0.25)
@@ -31,6 +34,8 @@ _VALUES = 3e7
 _GAINED = 1e-4
 # Share of what an effect does in one run from which the others hardly tell its numbers, and from which not at all.
 _ONCE, ALONE = 0.9, 0.99
+# Share φ of what the nominal model makes of the command: as of an effect, but most of it is right.
+_OF_NOMINAL = 1e-5
 
 
 def fit_many(
@@ -39,7 +44,7 @@ def fit_many(
     specs: Sequence[tuple[int, Spec]],
     steps: int = _STEPS,
     chosen: Tensor | None = None,
-    loose: Tensor | None = None,
+    nuisance: Tensor | None = None,
 ) -> list[Fit]:
     """Fit sets side by side.
 
@@ -49,7 +54,7 @@ def fit_many(
         specs: the axis and the set of each fit.
         steps: Gauss-Newton steps.
         chosen: stretches that count; all when None.
-        loose: whitened, what the nominal values of each axis may be off by, `n x k x v`; nothing when None.
+        nuisance: whitened, what the nominal values of each axis may be off by, `n x k x v`; nothing when None.
     """
     judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
     found: list[Fit] = []
@@ -58,7 +63,7 @@ def fit_many(
         lot.append((axis, spec))
         simulated = sum(len(one.moved) + 2 for _, one in lot) * judged.numel()
         if simulated > _VALUES or k == len(specs) - 1:
-            found += _fit_lot(problem, whitening, lot, steps, chosen, loose)
+            found += _fit_lot(problem, whitening, lot, steps, chosen, nuisance)
             lot = []
     return found
 
@@ -104,7 +109,7 @@ def _fit_lot(
     specs: Sequence[tuple[int, Spec]],
     steps: int,
     chosen: Tensor | None,
-    loose: Tensor | None,
+    nuisance: Tensor | None,
 ) -> list[Fit]:
     axis = torch.tensor([i for i, _ in specs])
     theta = torch.stack([s.theta for _, s in specs])
@@ -151,7 +156,7 @@ def _fit_lot(
     found = []
     for k, (i, spec) in enumerate(specs):
         x = columns[k, : len(spec.flat)]
-        beside = x[:0] if loose is None else loose[i]
+        beside = x[:0] if nuisance is None else nuisance[i]
         found.append(_fit_of(spec._replace(theta=theta[k]), residual[k], x, values, float(left[k]), folds, beside))
     return found
 
@@ -175,20 +180,20 @@ def _step(x: Tensor, y: Tensor, own: Tensor, real: Tensor, damping: Tensor, valu
         values: how many count.
     """
     noise = (y.square().sum(-1) / values).clamp_min(1e-300)[:, None]
-    gram, push = (x @ x.mT) / noise[..., None], (x @ y[..., None])[..., 0] / noise - own / _WIDE**2
+    gram, push = (x @ x.mT) / noise[..., None], (x @ y[..., None])[..., 0] / noise - own / WIDE**2
     diagonal = gram.diagonal(dim1=-2, dim2=-1)
-    inner = gram + torch.diag_embed(damping[:, None] * diagonal + 1 / _WIDE**2 + (1 - real))
+    inner = gram + torch.diag_embed(damping[:, None] * diagonal + 1 / WIDE**2 + (1 - real))
     move: Tensor = torch.linalg.solve(inner, push[..., None])[..., 0] * real
     return move.clamp(-_FARTHEST, _FARTHEST)
 
 
 def _fit_of(
-    spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, folds: Sequence[Tensor], loose: Tensor
+    spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, folds: Sequence[Tensor], nuisance: Tensor
 ) -> Fit:
     """The evidence of the model linearised at `spec.theta`.
 
     Args:
-        residual, x, loose: whitened, `v`, `m x v` and `k x v`.
+        residual, x, nuisance: whitened, `v`, `m x v` and `k x v`.
         values: how many count.
         left: mean square of the residual itself.
         folds: of each value, `v`: whole runs, and parts of them.
@@ -197,7 +202,7 @@ def _fit_of(
     # Runs of one stretch each have no parts.
     once = max(shares, default=0.0) if int(folds[1].max()) > 0 else 0.0
     y = residual + spec.theta[list(spec.flat)] @ x
-    grams = grams_of(torch.cat([x, loose]).mT[:, None, :], y[:, None])._replace(values=values)
+    grams = products(x, nuisance, y, values)
     fit = fit_sets(grams, [spec.groups], 0.0)
     m, evidence = len(x), float(fit.log_evidence[0])
     return Fit(
@@ -211,6 +216,14 @@ def _fit_of(
         left,
         grams,
     )
+
+
+def products(x: Tensor, nuisance: Tensor, y: Tensor, values: float) -> Grams:
+    """Inner products of whitened columns, `m x v`, and after them of what nominal values may be off by, `k x v`.
+
+    y: what they explain, `v`; values: how many of it count.
+    """
+    return grams_of(torch.cat([x, nuisance]).mT[:, None, :], y[:, None])._replace(values=values)
 
 
 def _in_one(does: Tensor, fold: Tensor) -> float:
@@ -241,4 +254,66 @@ def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Tensor], fo
 def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:
     """Half the deviance, `p`; residual `p x v`, theta `p x k`."""
     rss = residual.square().sum(-1)
-    return 0.5 * values * torch.log(rss.clamp_min(1e-300)) + 0.5 * theta.square().sum(-1) / _WIDE**2
+    return 0.5 * values * torch.log(rss.clamp_min(1e-300)) + 0.5 * theta.square().sum(-1) / WIDE**2
+
+
+def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: Sequence[float]) -> list[float]:
+    """Variance in every direction by which the forms of each axis' set and of the nominal model may be wrong.
+
+    Args:
+        problem: the data.
+        whitening: of the residual.
+        best: a set of each axis.
+        least: the variance of each axis is at least that.
+    """
+    theta = torch.zeros(len(best), problem.library.size, dtype=torch.float64)
+    command, names = problem.data.command, problem.library.names
+    does, most = (
+        problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
+        for v in (problem.positions(theta, problem.axes), problem.data.position)
+    )
+    found = []
+    for i, fit in enumerate(best):
+        shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in fit.members]
+        energy = fit_sets(fit.grams, [fit.spec.groups], 0.0).energy[0].tolist()[: len(shares)]
+        form = form_variance([*shares, _OF_NOMINAL], [*energy, does[i]], max(most[i], does[i]))
+        found.append(max(form, least[i]))
+    return found
+
+
+def weighed(grams: Grams, sets: Sequence[Sequence[Tensor]], columns: int, variance: float | None) -> Fits:
+    """Sets under a noise that is known, or that each leaves.
+
+    Args:
+        grams: of the columns, and after them of those by which the nominal values may be off, coefficients of standard
+            deviation 1: they add to the noise.
+        sets: of groups of columns.
+        columns: how many are fitted.
+        variance: of the noise; None = what each set leaves, nominal values being exact.
+    """
+    if variance is None:
+        return fit_sets(grams, sets, 0.0)
+    g = scaled(grams, variance)
+    across = torch.cat([g.xx[columns:, :columns], g.xy[columns:, None]], -1)
+    inner = g.xx[columns:, columns:] + torch.eye(len(across), dtype=across.dtype)
+    taken = across.mT @ torch.linalg.solve(inner, across)
+    left = Grams(
+        g.xx[:columns, :columns] - taken[:-1, :-1], g.xy[:columns] - taken[:-1, -1], g.yy - taken[-1, -1], g.values
+    )
+    return fit_sets(left, sets, CERTAIN * grams.values)
+
+
+def deviations(fit: Fit, variance: float) -> Tensor:
+    """Standard deviations of a set's numbers, `m` in plausible sizes, under a noise that holds form errors as well.
+
+    The values of the nominal model are taken for exact here.
+    """
+    m, grams = len(fit.spec.flat), fit.grams
+    own = grams._replace(xx=grams.xx[:m, :m], xy=grams.xy[:m])
+    found = weighed(own, [fit.spec.groups], m, max(variance, fit.noise))
+    return found.covariance[0, :m, :m].diagonal().clamp_min(0).sqrt()
+
+
+def unseen_errors(found: Sequence[Sequence[Fit]]) -> list[float]:
+    """Variance in every direction by which the best of each axis' sets is worse on runs that it was not fitted to."""
+    return [max(min(f.unseen for f in own) - min(f.rss for f in own), 0.0) / DIRECTIONS for own in found]

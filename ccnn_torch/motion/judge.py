@@ -3,6 +3,9 @@
 The forms of effects, and that of the nominal model, are those of the machine only nearly: sets are weighed again under
 a noise with their form errors in it (`evidence.form_error`). Members that take nothing away on runs that were
 not fitted are left out of a set before it counts.
+
+Beside sets stand what no effect describes: groups of columns that follow a driver (speed, acceleration, reversal,
+position, torque, time, temperature), added to the simulated position or to the torque that the axis moves under.
 """
 
 from __future__ import annotations
@@ -16,14 +19,12 @@ from torch import Tensor
 
 from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.evidence.judge import judge, marginal, posterior
-from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets, grams_of
+from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets
 from ccnn_torch.evidence.priors import OUTSIDE, crowd
-from ccnn_torch.motion.drivers import Driver, driver_columns
-from ccnn_torch.motion.fit import sensitivities, squares_unseen
-from ccnn_torch.motion.form import weighed
+from ccnn_torch.motion.fit import products, sensitivities, squares_unseen, weighed
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, log_posterior
-from ccnn_torch.motion.spec import Fit
+from ccnn_torch.motion.spec import Fit, Spec
 from ccnn_torch.motion.whiten import white_noise
 
 # Probability of something outside that takes nothing away on runs that no fit saw, and of nothing where a set leaves
@@ -33,6 +34,20 @@ _UNCONFIRMED, _CLEARLY = 0.5, 3.0
 _BASES = 6
 # Share of what is left of runs that were not fitted up to which a set without a member is as good.
 _NEARLY = 1.02
+# Knots of a piecewise linear function: at quantiles of a driver, and evenly spaced ones of a position and of the time.
+_KNOTS, _EVENLY = 7, 9
+# Time constants of what fades after a reversal [s].
+_FADING = (0.03, 0.1, 0.3)
+# Share of the mean speed at which a direction is settled.
+_SOFT = 0.1
+# Changes of the temperature below this show nothing [K].
+_WARMER = 5.0
+# Share of the motion from which the lead of the command over the position is a torque.
+_LOADED = 1e-4
+# Quantiles between which the knots lie.
+_ENDS = (0.02, 0.98)
+# Share of the motion by which a torque moves the axis for its columns, and how far the columns reach.
+_STEP, _SIZE = 1e-3, 0.05
 
 Members = tuple[int, ...]
 
@@ -73,28 +88,27 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     by_members = {f.members: f for f in fits}
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
-    sets = [Candidate((essential(f.members, left, unseen), None), f.grams, f.spec.groups, prior_of(f)) for f in fits]
+    sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f)) for f in fits]
     sets += with_drivers(found, axis, drivers, by_members)
     levels = []
     for level in LEVELS:
         weights = _weights(sets, fits[0].noise, level * found.form[axis], level * OF_SMOOTH)
-        named = [(frozenset(one.key[0]), () if one.key[1] is None else (one.key[1],)) for one in sets]
-        weighed_sets = [(*name, w, one) for name, w, one in zip(named, weights, sets, strict=True)]
-        levels.append((1 / len(LEVELS), weighed_sets))
+        named = [(frozenset(one.members), one.drivers, w, one) for w, one in zip(weights, sets, strict=True)]
+        levels.append((1 / len(LEVELS), named))
     explanations = posterior(levels)
     verdict = judge(explanations, explanations, of_classes=True)
-    best, hidden = by_members[verdict.chosen.best.key[0]], None
+    best, hidden = by_members[verdict.chosen.best.members], None
     probability = verdict.probability
     if verdict.outside and not holds(problem, verdict.chosen.best):
         probability = min(probability, _UNCONFIRMED)
-    if not best.members and not verdict.outside and _after_loose(best, fits[0].noise) > _CLEARLY**2 * fits[0].rss:
+    if not best.members and not verdict.outside and _after_nuisance(best, fits[0].noise) > _CLEARLY**2 * fits[0].rss:
         hidden = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left).members[0]
     marginals = {e: marginal(explanations, e) for e in {e for f in fits for e in f.members}}
     driver = verdict.drivers[0] if verdict.outside else None
     return AxisVerdict(best, probability, marginals, verdict.classes, driver, hidden)
 
 
-def _after_loose(nothing: Fit, noise: float) -> float:
+def _after_nuisance(nothing: Fit, noise: float) -> float:
     """Squares that are left of nothing where nominal values and time stamps are off as far as is likely."""
     xx, xy = nothing.grams.xx, nothing.grams.xy
     inner = xx + noise * torch.eye(len(xx), dtype=xx.dtype)
@@ -130,12 +144,14 @@ class Candidate(NamedTuple):
     """A set of effects, with a driver or without, as it is weighed.
 
     Attributes:
-        key: members that do something, and the driver.
+        members: those that do something.
+        drivers: what a term beside them follows; () = there is none, or it does next to nothing.
         grams, groups, log_prior: of its model linearised.
         rows: with a driver, whitened columns of members and driver, `m x v` each, and what they explain, `v`.
     """
 
-    key: tuple[Members, str | None]
+    members: Members
+    drivers: tuple[str, ...]
     grams: Grams
     groups: list[Tensor]
     log_prior: float
@@ -193,18 +209,16 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
         prior = prior_of(base) + OUTSIDE + crowd(count + 1) - crowd(count)
         for k, (driver, columns, beside) in enumerate(zip(drivers, white, plain, strict=True)):
             x = torch.cat([own, columns])
-            grams = grams_of(torch.cat([x, found.loose[axis]]).mT[:, None, :], y[:, None])._replace(values=values)
+            grams = products(x, found.nuisance[axis], y, values)
             groups = [*base.spec.groups, torch.arange(len(flat), len(x))]
             mean = fit_sets(grams, [groups], 0.0).mean[0]
             rest = left_plain - (mean[: len(flat)] - theta[flat]) @ own_plain - mean[len(flat) : len(x)] @ beside
             taken[k][base.members] = float(rest.square().sum())
             gained = float(left_plain.square().sum()) - taken[k][base.members]
-            there = driver.name if gained >= slight else None
-            sets.append((k, Candidate((base.members, there), grams, groups, prior, (own, columns, y))))
+            there = (driver.name,) if gained >= slight else ()
+            sets.append((k, Candidate(base.members, there, grams, groups, prior, (own, columns, y))))
     # Beside a driver a name has to do what the driver does not do as well.
-    return [
-        one._replace(key=(essential(one.key[0], taken[k] if one.key[1] else left, {}), one.key[1])) for k, one in sets
-    ]
+    return [one._replace(members=essential(one.members, taken[k] if one.drivers else left, {})) for k, one in sets]
 
 
 def holds(problem: Problem, candidate: Candidate) -> bool:
@@ -217,3 +231,117 @@ def holds(problem: Problem, candidate: Candidate) -> bool:
         for x, groups in ((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))
     )
     return more < less
+
+
+class Driver(NamedTuple):
+    """A driver and its columns in plausible sizes [rad or m], `n x m x b x s`."""
+
+    name: str
+    columns: Tensor
+
+
+def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
+    """Columns of each driver, and those of a torque that follows it; drivers that do not vary are left out.
+
+    Args:
+        problem: the data.
+        specs: of each axis the set whose motion tells speed, acceleration and torque.
+    """
+    data = problem.data
+    theta = torch.stack([spec.theta for spec in specs])
+    moved = problem.positions(theta, problem.axes)
+    step = data.time.diff(dim=-1).clamp_min(1e-9)
+    speed = _slope(moved, step)
+    acceleration = _slope(speed, step)
+    error = problem.followed - moved
+    # An axis that follows exactly has no torque, and what rounding leaves of it has the sign of the speed.
+    span = (data.position.amax((-1, -2)) - data.position.amin((-1, -2)))[:, None, None, None]
+    loaded = error.abs().amax((-1, -2))[:, None, None, None] > _LOADED * span
+    place, over = _evenly(moved, data.judged), _over_time(problem)
+    sign = _direction(speed)[:, None]
+    fast = _hats(speed, data.judged)
+    direct = {
+        "speed": fast,
+        "acceleration": _hats(acceleration, data.judged),
+        "reversal": _fading(speed, data.time),
+        "position": place,
+        "torque": _hats(error, data.judged) * loaded,
+        # A constant of its own: what drifts begins somewhere.
+        "time": torch.cat([torch.ones_like(over[:, :1]), over], 1),
+    }
+    # Friction comes and goes with the place, the time and the temperature as well.
+    pushed = [("speed", fast), ("position", place), ("position", place * sign), ("time", over * sign)]
+    if float(problem.warm.abs().max()) >= _WARMER:
+        warm = (problem.warm / problem.warm.abs().max()).expand(len(moved), -1, -1)[:, None]
+        pushed.append(("temperature", warm * sign))
+        direct["temperature"] = warm
+    found = [Driver(name, _SIZE * span * columns) for name, columns in direct.items()]
+    under = problem.pushed(theta, torch.cat([_STEP * span * columns for _, columns in pushed], 1))
+    columns = (under - moved[:, None]) * (_SIZE / _STEP)
+    widths = [c.shape[1] for _, c in pushed]
+    return found + [Driver(n, c) for (n, _), c in zip(pushed, torch.split(columns, widths, 1), strict=True)]
+
+
+def _direction(speed: Tensor) -> Tensor:
+    """The sign of the speed, soft near standstill."""
+    size = speed.abs().mean((-1, -2), keepdim=True)
+    return torch.tanh(speed / (_SOFT * size).clamp_min(1e-12))
+
+
+def _slope(values: Tensor, step: Tensor) -> Tensor:
+    slope = values.diff(dim=-1) / step
+    return torch.cat([slope[..., :1], slope], -1)
+
+
+def _hats(driver: Tensor, judged: Tensor) -> Tensor:
+    """Piecewise linear functions with their knots at quantiles, `n x m x b x s`."""
+    found = []
+    for one in driver:
+        some = one[judged][:: max(int(judged.sum()) // 10_000, 1)]
+        knots = torch.unique(torch.quantile(some, torch.linspace(*_ENDS, _KNOTS, dtype=one.dtype)))
+        if len(knots) < 3:
+            found.append(torch.zeros(_KNOTS, *one.shape, dtype=one.dtype))
+            continue
+        place = (torch.searchsorted(knots, one.contiguous()) - 1).clamp(0, len(knots) - 2)
+        share = ((one - knots[place]) / (knots[place + 1] - knots[place])).clamp(0, 1)
+        hats = torch.zeros(_KNOTS, *one.shape, dtype=one.dtype)
+        hats.scatter_(0, place[None], (1 - share)[None])
+        hats.scatter_(0, place[None] + 1, share[None])
+        found.append(hats)
+    return torch.stack(found)
+
+
+def _evenly(driver: Tensor, judged: Tensor) -> Tensor:
+    """Piecewise linear functions with evenly spaced knots, `n x m x b x s`."""
+    low = torch.stack([one[judged].min() for one in driver])[:, None, None]
+    high = torch.stack([one[judged].max() for one in driver])[:, None, None]
+    return _tents((driver - low) / (high - low).clamp_min(1e-12))
+
+
+def _tents(share: Tensor) -> Tensor:
+    """Of a driver from 0 to 1, `n x b x s`."""
+    knots = torch.linspace(0, 1, _EVENLY, dtype=share.dtype)[:, None, None]
+    return (1 - (share[:, None] - knots).abs() * (_EVENLY - 1)).clamp_min(0)
+
+
+def _fading(speed: Tensor, time: Tensor) -> Tensor:
+    """What jumps with the sign of the speed at a reversal and fades, `n x m x b x s`."""
+    sign = torch.sign(speed)
+    turned = torch.zeros_like(sign)
+    turned[..., 1:] = 0.5 * (sign[..., 1:] - sign[..., :-1])
+    fall = torch.exp(-time.diff(dim=-1) / torch.tensor(_FADING, dtype=time.dtype)[:, None, None])
+    columns = turned[:, None].repeat(1, len(_FADING), 1, 1)
+    for k in range(1, sign.shape[-1]):
+        columns[..., k] += columns[..., k - 1] * fall[..., k - 1]
+    return columns
+
+
+def _over_time(problem: Problem) -> Tensor:
+    """Piecewise linear functions of the time in each run, `n x m x b x s`."""
+    data = problem.data
+    share = torch.zeros_like(data.time)
+    for run in sorted(set(data.run.tolist())):
+        mine = data.run == run
+        ends = data.time[mine][data.judged[mine]]
+        share[mine] = ((data.time[mine] - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)).clamp(0, 1)
+    return _tents(share[None]).expand(len(problem.followed), -1, -1, -1)

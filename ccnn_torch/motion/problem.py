@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ccnn_torch.evidence.shrink import FOLDS
 from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.effects.bodies import CARRIED
 from ccnn_torch.motion.effects.registry import OWN
@@ -18,13 +19,12 @@ from ccnn_torch.motion.whiten import Whitening
 
 # Of an axis that ran away: no residual is larger, in units of the motion.
 _FARTHEST = 10.0
-_FOLDS = 5
 # Share to which the values of a nominal model are known (standard deviation), and those that are.
 _KNOWN = 0.03
 # Share of a sampling step by which the time stamps of commands and positions may differ (standard deviation).
 _STAMP = 0.1
 _WEIGHT = ("gravity_sin", "gravity_cos")
-_LOOSE = (
+_UNSURE = (
     *(*_WEIGHT, "gain", "integral", "derivative", "inertia", "viscous", "coulomb", "load_friction", "stribeck"),
     *("weakness", "delay"),
 )
@@ -131,7 +131,7 @@ class Problem:
         moved = wide.positions(theta, self.axes).reshape(n, m, b, s)
         return moved if self.simulated is None else moved + self._beyond[:, None]
 
-    def loose(self, theta: Tensor) -> Tensor:
+    def nuisance(self, theta: Tensor) -> Tensor:
         """What the positions change by when a nominal parameter is off by what it is known to, `k x n x b x s`.
 
         About `theta`, `n x k`, the machine as it seems to be: a model that is wrong may be near to its stability.
@@ -142,7 +142,7 @@ class Problem:
         weight = torch.hypot(*(nominal.get(name, absent) for name in _WEIGHT))
         sizes = {"gain": torch.ones_like(absent), **nominal, **dict.fromkeys(_WEIGHT, weight)}
         for name, size in sizes.items() if nominal else ():
-            if name in _LOOSE and bool((size != 0).any()):
+            if name in _UNSURE and bool((size != 0).any()):
                 before = nominal.get(name, sizes["gain"] if name == "gain" else absent)
                 other = self.library._replace(nominal={**nominal, name: before + _KNOWN * size})
                 columns.append(replace(self, library=other)._moved(theta, self.axes, rows, self._start) - plain)
@@ -207,7 +207,7 @@ class Problem:
         runs = torch.tensor(sorted(set(run.tolist())))
         if len(runs) < 2 or self.parted:
             return self.part
-        return (torch.arange(len(runs)) % min(_FOLDS, len(runs)))[torch.searchsorted(runs, run)]
+        return (torch.arange(len(runs)) % min(FOLDS, len(runs)))[torch.searchsorted(runs, run)]
 
     @cached_property
     def part(self) -> Tensor:
@@ -216,7 +216,7 @@ class Problem:
         found = torch.zeros_like(run)
         for one in set(run.tolist()):
             count = int((run == one).sum())
-            found[run == one] = torch.arange(count) * min(_FOLDS, count) // count
+            found[run == one] = torch.arange(count) * min(FOLDS, count) // count
         return found
 
     @property

@@ -13,10 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.evidence.priors import EFFECT, crowd
-from ccnn_torch.motion.fit import fit_many, sensitivities
-from ccnn_torch.motion.form import form_errors, unseen_errors, weighed
+from ccnn_torch.motion.fit import fit_many, form_errors, products, sensitivities, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.spec import Fit, Spec, started, without
@@ -40,17 +38,17 @@ class Search(NamedTuple):
         problem: the data.
         whitening: of the residual of each axis.
         found: of each axis the fits of all sets, most probable first.
-        rich: residual of each axis under the white fit with the most effects, `n x b x s` [rad or m].
+        largest: residual of each axis under the largest model, of white noise, `n x b x s` [rad or m].
         form: variance of the form errors of each axis, as of `form_errors`.
-        loose: as of `fit_many`.
+        nuisance: as of `fit_many`.
     """
 
     problem: Problem
     whitening: Whitening
     found: tuple[tuple[Fit, ...], ...]
-    rich: Tensor
+    largest: Tensor
     form: tuple[float, ...]
-    loose: Tensor
+    nuisance: Tensor
 
 
 def log_posterior(fit: Fit) -> float:
@@ -64,8 +62,8 @@ def search(problem: Problem) -> Search:
     n = len(problem.followed)
     plain = _Pool(problem, white_noise(n))
     plain.forward()
-    rich = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
-    pool = _Pool(problem, fitted_whitening(problem.pooled(rich), problem.judged))
+    largest = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
+    pool = _Pool(problem, fitted_whitening(problem.pooled(largest), problem.judged))
     pool.again(plain)
     pool.forward()
     # The noise of what is left by what is most probable now.
@@ -87,7 +85,9 @@ def search(problem: Problem) -> Search:
     form = form_errors(problem, final.whitening, final.best(), unseen)
     final.variance = None
     final.reduced()
-    return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich, tuple(form), final.loose)
+    return Search(
+        problem, final.whitening, tuple(tuple(p) for p in final.ranked()), largest, tuple(form), final.nuisance
+    )
 
 
 class _Pool:
@@ -97,9 +97,9 @@ class _Pool:
         self.problem, self.whitening = problem, whitening
         # Nothing, as long as each set has the noise that it leaves.
         self.axes = len(problem.followed)
-        loose = problem.followed.new_zeros(0, *problem.followed.shape) if about is None else problem.loose(about)
-        white = problem.whitened(loose.flatten(0, 1), problem.axes.repeat(len(loose)), whitening)
-        self.loose = white.reshape(len(loose), self.axes, white.shape[-1]).transpose(0, 1)
+        nuisance = problem.followed.new_zeros(0, *problem.followed.shape) if about is None else problem.nuisance(about)
+        white = problem.whitened(nuisance.flatten(0, 1), problem.axes.repeat(len(nuisance)), whitening)
+        self.nuisance = white.reshape(len(nuisance), self.axes, white.shape[-1]).transpose(0, 1)
         self.library: Library = problem.library
         zero = torch.zeros(self.library.size, dtype=torch.float64)
         # Of noise and form errors of each axis; None: the noise that each set leaves.
@@ -124,16 +124,15 @@ class _Pool:
         key = (axis, fit.members, self.variance[axis])
         old = self.scores.get(key)
         if old is None or old[0] is not fit:
-            evidence = float(
-                weighed(fit.grams, [fit.spec.groups], len(fit.spec.flat), self.variance[axis]).log_evidence[0]
-            )
+            weighed_fit = weighed(fit.grams, [fit.spec.groups], len(fit.spec.flat), self.variance[axis])
+            evidence = float(weighed_fit.log_evidence[0])
             old = self.scores[key] = fit, evidence + log_posterior(fit) - fit.log_evidence
         return old[1]
 
     def fit(self, wanted: Sequence[Sequence[Spec]], steps: int) -> None:
         """Fit sets of each axis; one that was fitted before stays if it was better."""
         pairs = [(i, spec) for i, own in enumerate(wanted) for spec in own]
-        fits = fit_many(self.problem, self.whitening, pairs, steps, loose=self.loose)
+        fits = fit_many(self.problem, self.whitening, pairs, steps, nuisance=self.nuisance)
         for (i, _), fit in zip(pairs, fits, strict=True):
             old = self.found[i].get(fit.members)
             if old is None or log_posterior(fit) > log_posterior(old):
@@ -173,20 +172,7 @@ class _Pool:
         """The most probable set without each of its members, and with another effect in the place of each."""
         for _ in range(3):
             before = self.best()
-            less = [
-                [
-                    s
-                    for k in range(len(f.members))
-                    if (s := without(self.library, f.spec, k)).members not in self.found[i]
-                ]
-                for i, f in enumerate(before)
-            ]
-            self.fit(less, _LONG)
-            bases = [
-                [self.found[i][without(self.library, f.spec, k).members] for k in range(len(f.members))]
-                for i, f in enumerate(before)
-            ]
-            self.fit(self.screened(bases), _LONG)
+            self.fit(self.screened(self.fewer([f.spec for f in before], _LONG)), _LONG)
             if all(a.members == b.members for a, b in zip(before, self.best(), strict=True)):
                 return
 
@@ -194,27 +180,21 @@ class _Pool:
         """The most probable set of each axis without its least members, one after the other, down to none."""
         now = [f.spec for f in self.best()]
         while any(s.members for s in now):
-            less = [
-                [o for k in range(len(s.members)) if (o := without(self.library, s, k)).members not in self.found[i]]
-                for i, s in enumerate(now)
-            ]
-            self.fit(less, _SHORT)
-            now = [
-                min(
-                    (self.found[i][without(self.library, s, k).members] for k in range(len(s.members))),
-                    key=lambda f: f.left,
-                ).spec
-                if s.members
-                else s
-                for i, s in enumerate(now)
-            ]
+            less = self.fewer(now, _SHORT)
+            now = [min(own, key=lambda f: f.left).spec if own else s for s, own in zip(now, less, strict=True)]
+
+    def fewer(self, sets: Sequence[Spec], steps: int) -> list[list[Fit]]:
+        """The set of each axis without each of its members, fitted where it was not before."""
+        less = [[without(self.library, s, k) for k in range(len(s.members))] for s in sets]
+        self.fit([[s for s in own if s.members not in self.found[i]] for i, own in enumerate(less)], steps)
+        return [[self.found[i][s.members] for s in own] for i, own in enumerate(less)]
 
     def screened(self, bases: Sequence[Sequence[Fit]], most: int = _FITTED) -> list[list[Spec]]:
         """For each base the new effects that promise most, by what a difference quotient of each explains."""
         wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
         for i, fit in [(i, fit) for i, own in enumerate(bases) for fit in own]:
             scores: dict[int, tuple[float, Variant]] = {}
-            for score, variant in promise(self.problem, self.whitening, i, fit, self.loose[i], self.noise_of(i)):
+            for score, variant in promise(self.problem, self.whitening, i, fit, self.nuisance[i], self.noise_of(i)):
                 if variant.effect not in scores or score > scores[variant.effect][0]:
                     scores[variant.effect] = (score, variant)
             ranked = (variant for _, variant in sorted(scores.values(), key=lambda item: -item[0]))
@@ -226,7 +206,7 @@ class _Pool:
 
 
 def promise(
-    problem: Problem, whitening: Whitening, i: int, base: Fit, loose: Tensor, variance: float | None
+    problem: Problem, whitening: Whitening, i: int, base: Fit, nuisance: Tensor, variance: float | None
 ) -> list[tuple[float, Variant]]:
     """For every variant of an effect that an axis can show and a set lacks, the evidence of both together.
 
@@ -235,7 +215,7 @@ def promise(
         whitening: of the residual.
         i: the axis.
         base: its set.
-        loose: as of `fit_many`, of this axis.
+        nuisance: as of `fit_many`, of this axis.
         variance: of noise and form errors; None: the noise that each set leaves.
     """
     library, theta, flat = problem.library, base.spec.theta, list(base.spec.flat)
@@ -258,15 +238,11 @@ def promise(
     new = (residual - left) / left.new_tensor(steps)[:, None]
     x = torch.cat([own[0], new])
     y = residual[0] + theta[flat] @ own[0]
-    grams = grams_of(torch.cat([x, loose]).mT[:, None, :], y[:, None])
-    grams = grams._replace(values=float(problem.judged.sum()))
+    grams = products(x, nuisance, y, float(problem.judged.sum()))
     ends = torch.tensor([len(v.active) for v in variants]).cumsum(0) + len(flat)
     sets = [
         [*base.spec.groups, torch.arange(int(end) - len(v.active), int(end))]
         for v, end in zip(variants, ends, strict=True)
     ]
-    if variance is None:
-        scores = fit_sets(grams, sets, 0.0).log_evidence.tolist()
-    else:
-        scores = weighed(grams, sets, len(x), variance).log_evidence.tolist()
+    scores = weighed(grams, sets, len(x), variance).log_evidence.tolist()
     return [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, variants, strict=True)]

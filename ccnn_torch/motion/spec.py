@@ -55,7 +55,7 @@ class Fit(NamedTuple):
         unseen: the same on runs that its numbers were not fitted to, or on parts of runs.
         once: largest share of what a member does in one run, which is large of a limit: then these are parts of runs.
         left: mean square of the residual itself [rad^2 or m^2].
-        grams: of the linearised model's whitened columns, in plausible sizes, and of `loose` after them.
+        grams: of the linearised model's whitened columns, in plausible sizes, and of `nuisance` after them.
     """
 
     spec: Spec

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+from typing import NamedTuple
 
+import pytest
+import torch
+
+from ccnn_torch.evidence.beam import probable_sets
+from ccnn_torch.evidence.dictionary import dictionary_of, singles_of
 from ccnn_torch.evidence.judge import Explanation, Verdict, judge, marginal, posterior
 from ccnn_torch.evidence.priors import EFFECT, OUTSIDE, crowd
 
@@ -115,3 +120,29 @@ def test_levels_of_the_form_error_are_averaged_by_their_weights() -> None:
 def test_a_third_cause_is_ten_times_as_rare_and_something_outside_a_hundred_times() -> None:
     assert [pytest.approx(10**x) for x in (0, 0, 0, -1, -2)] == [2.718281828459045 ** crowd(n) for n in range(5)]
     assert pytest.approx(-crowd(4)) == EFFECT - OUTSIDE
+
+
+class Cause(NamedTuple):
+    name: str
+    log_prior: float = EFFECT
+    is_discrepancy: bool = False
+    plain: bool = False
+    form_error: float = 0.0
+
+
+def names_beside(third: float) -> set[str]:
+    """Names where two causes are plain to see under noise of 1 and a third has this size."""
+    x = torch.linalg.qr(torch.randn(60, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)).Q
+    y = (x @ torch.tensor([40.0, 30.0, third], dtype=torch.float64))[:, None]
+    causes, columns = [Cause(name) for name in "abc"], [x[:, None, k : k + 1] for k in range(3)]
+    dictionary = dictionary_of(causes, columns, y, [], singles_of(causes, columns, y, 6000.0), 6000.0)
+    sets = probable_sets(dictionary)
+    named = [(frozenset(causes[i].name for i in s.members), (), s.log_posterior, s.members) for s in sets]
+    explanations = posterior([(1.0, named)])
+    return {*judge(explanations, explanations).chosen.names}
+
+
+def test_a_third_cause_has_to_show_more_than_a_second() -> None:
+    # Were it as probable beforehand as a second one, four standard deviations would do.
+    assert names_beside(4.0) == {"a", "b"}
+    assert names_beside(4.6) == {"a", "b", "c"}

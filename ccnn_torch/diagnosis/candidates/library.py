@@ -249,7 +249,10 @@ def single_joint_atoms(
         evidence = fit_single_groups([own for group in cut for own in group], squares, prior)[0].log_evidence
         for choice, mine in zip(going, torch.split(evidence, counts), strict=True):
             choice.take(mine)
-    return [_cut(atom, choices[k]) if k in choices else None for k, atom in enumerate(atoms)]
+    return [
+        _with(atom, (c := choices[k]).chosen, c.lots * c.charge) if k in choices else None
+        for k, atom in enumerate(atoms)
+    ]
 
 
 def without_secondary(situation: Situation, atoms: Sequence[Atom]) -> list[Atom]:
@@ -266,10 +269,6 @@ def without_secondary(situation: Situation, atoms: Sequence[Atom]) -> list[Atom]
         parts = [main] if main == formed else [main, formed]
         found += [_with(atom, part, _EITHER) for part in parts if 0 < len(part) < len(coefficients)]
     return found
-
-
-def _cut(atom: Atom, choice: _Choice) -> Atom:
-    return _with(atom, choice.chosen, choice.lots * choice.charge)
 
 
 def _with(atom: Atom, chosen: list[int], charge: float) -> Atom:

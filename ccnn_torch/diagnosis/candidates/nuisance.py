@@ -12,11 +12,10 @@ import torch
 from torch import Tensor, unflatten
 
 from ccnn_torch.evidence.marginal_likelihood import JITTER, GroupProducts, Prior, fit_single_groups
+from ccnn_torch.evidence.priors import WIDE
 
 # Relative ridge of the regression on a candidate.
 _RIDGE = 1e-6
-# Plausible sizes that nuisance may have: it takes what it can explain, and does not leave it to candidates.
-_WIDE = 10.0
 FINE, ROUNDS = 9, 3
 """Values between the neighbours of the best of a grid, and how often there are such between those of the last."""
 
@@ -119,7 +118,7 @@ class NuisanceFit:
         return other
 
     def _take(self, more: Tensor) -> None:
-        flat = _WIDE * more.flatten(-3, -2)
+        flat = WIDE * more.flatten(-3, -2)
         cross = self._taken @ flat
         gram = flat.mT @ flat
         if gram.shape[-1]:

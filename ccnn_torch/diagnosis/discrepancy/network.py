@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis.shrink.held_out import folds
 from ccnn_torch.diagnosis.verdict.blocks import noise_floor
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.evidence.marginal_likelihood import fit_sets, without
-from ccnn_torch.evidence.shrink import INTERVAL, resampled
+from ccnn_torch.evidence.shrink import FOLDS, INTERVAL, resampled
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.ccnn import CCNN
@@ -25,7 +25,6 @@ from ccnn_torch.training import Scaling, train
 Progress = Callable[[float], None]
 """Told the share that is done, 0 to 1."""
 
-_FOLDS = 5
 # Networks of many values (rows times joints) are slow: they are trained without only so many of the folds.
 _MANY_VALUES, _FEW_FOLDS = 1500, 2
 # Updates of the fit of the effects in each fold.
@@ -92,7 +91,7 @@ def remaining_gain(
     if len(rows) > most:
         drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
         rows = drawn[:most].sort().values
-    trained = _FOLDS if len(rows) * len(analysis.situation.mechanism.joints) <= _MANY_VALUES else _FEW_FOLDS
+    trained = FOLDS if len(rows) * len(analysis.situation.mechanism.joints) <= _MANY_VALUES else _FEW_FOLDS
     left = _left(analysis, judgement, fold, trained)[:, rows]
     judged = torch.nonzero(fold[rows] < trained).squeeze(-1)
     here = (fold[rows][judged], judged)

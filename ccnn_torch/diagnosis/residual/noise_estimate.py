@@ -1,15 +1,14 @@
-"""Noise and robust row weights from the residual of the richest fit."""
+"""Noise and robust row weights from the residual of the largest model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, MAD, NO_NOISE, Whitening, renewed
+from ccnn_torch.diagnosis.residual.whitening import MAD, NO_NOISE, Whitening, renewed
 from ccnn_torch.evidence.marginal_likelihood import (
     NO_COLUMNS,
     Axes,
@@ -20,11 +19,12 @@ from ccnn_torch.evidence.marginal_likelihood import (
     fit_sets,
     fit_single_groups,
     grams_of,
+    groups_of,
     own_products,
 )
 
-# The richest fit: at most so many candidates, the log evidence from which one is taken in, the spread of its log size.
-_RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
+# The largest model: how many candidates at most, the log evidence from which one is in it, the spread of its log size.
+_LARGEST, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
 # Candidates that are evaluated with the rows' weights as they are, the most promising when all weigh alike.
 _NEXT = 4
 # The principal axes of all are taken anew where the channels' noise has changed by more among each other (logarithm).
@@ -38,7 +38,7 @@ _KNOWN = 50.0
 def fitted_whitening(
     residual: Tensor, columns: Sequence[Tensor], channels: Tensor, noise: Tensor | None, usable: Tensor
 ) -> Whitening:
-    """Noise and row weights from the richest fit: of everything that may be there, one by one what explains most of
+    """Noise and row weights from the largest model: of everything that may be there, one by one what explains most of
     what is left, as long as the evidence for it is more than slight.
 
     Args:
@@ -61,17 +61,13 @@ def fitted_whitening(
     chosen: list[int] = []
     log_scale = y.new_zeros(1, 0)
     left, free = y, 1.0
-    for _ in range(_RICH):
+    for _ in range(_LARGEST):
         if chosen:
             own = torch.cat([shown[k] / every.size[k] for k in chosen], -1)
-            ends = torch.tensor([shown[k].shape[-1] for k in chosen]).cumsum(0).tolist()
-            parts = [torch.arange(e - shown[k].shape[-1], e) for e, k in zip(ends, chosen, strict=True)]
-            grams = grams_of(white.scaled(own), white.scaled(y))
-            fit = fit_sets(grams, [parts], 0.0, _UPDATES, _ANY_SIZE, (log_scale, y.new_ones(1)))
+            grams, groups = grams_of(white.scaled(own), white.scaled(y)), groups_of(shown[k] for k in chosen)
+            fit = fit_sets(grams, [groups], 0.0, _UPDATES, _ANY_SIZE, (log_scale, y.new_ones(1)))
             left, log_scale = y - own @ fit.mean[0], fit.log_scale
-            free = max(
-                1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), LEAST_FREE
-            )
+            free = 1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0)
             white = renewed(white, left, y, free, usable)
         rest = [k for k in range(len(shown)) if k not in chosen]
         if not rest:
@@ -80,26 +76,14 @@ def fitted_whitening(
         rough = every.roughly_added(white, left)[rest]
         likely = [rest[k] for k in rough.argsort(descending=True)[:_NEXT].tolist()]
         products = [own_products(white.scaled(shown[k]), white.scaled(left), every.size[k]) for k in likely]
-        added = _additions(products, squares, y.numel())
-        best = int(added.gain.argmax())
-        if float(added.gain[best]) < _SLIGHT:
+        fits, _ = fit_single_groups([NO_COLUMNS, *products], squares, Prior(float(y.numel()), 0.0, _ANY_SIZE))
+        gain = fits.log_evidence[1:] - fits.log_evidence[0]
+        best = int(gain.argmax())
+        if float(gain[best]) < _SLIGHT:
             break
         chosen.append(likely[best])
-        log_scale = torch.cat([log_scale, added.log_scale[None, best : best + 1]], -1)
+        log_scale = torch.cat([log_scale, fits.log_scale[1 + best : 2 + best]], -1)
     return renewed(white, left, y, free, usable)
-
-
-class _Addition(NamedTuple):
-    """Log evidence gained by each of the candidates, `k`, and log α² with which it is, `k`."""
-
-    gain: Tensor
-    log_scale: Tensor
-
-
-def _additions(products: Sequence[GroupProducts], squares: Tensor, values: int) -> _Addition:
-    """products: of each candidate; squares: of what it is added to, and of how many values."""
-    fits, _ = fit_single_groups([NO_COLUMNS, *products], squares, Prior(float(values), 0.0, _ANY_SIZE))
-    return _Addition(fits.log_evidence[1:] - fits.log_evidence[0], fits.log_scale[1:])
 
 
 class _Everything:

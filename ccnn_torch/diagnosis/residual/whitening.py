@@ -24,8 +24,8 @@ LEAST_FREE = 0.1
 _LEAST_NOISE = 1e-4
 # Quantile of the rows that are never set aside; ratio of the fourth moment to a normal one from which tails are heavy.
 _KEPT, _HEAVY = 0.8, 1.5
-# Directions of what was fitted before with less than this share of the largest one are rounding.
-_DIGITS = 1e-9
+ROUNDING = 1e-9
+"""Directions of what was fitted before with less than this share of the largest one are rounding."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def without_fitted(fitted: Tensor, columns: Sequence[Tensor]) -> list[Tensor]:
     if not fitted.shape[-1]:
         return [*columns]
     u, s, _ = torch.linalg.svd(fitted.flatten(0, 1), full_matrices=False)
-    q = u[:, s > _DIGITS * s[0]]
+    q = u[:, s > ROUNDING * s[0]]
     return [(c.flatten(0, 1) - q @ (q.mT @ c.flatten(0, 1))).reshape(c.shape) for c in columns]
 
 
@@ -126,7 +126,7 @@ def size_of_fitted(fitted: Tensor) -> float:
     if not fitted.shape[-1]:
         return 0.0
     values = torch.linalg.svdvals(fitted.flatten(0, 1))
-    return float(values[values > _DIGITS * values[0]].log().sum())
+    return float(values[values > ROUNDING * values[0]].log().sum())
 
 
 def renewed(white: Whitening, left: Tensor, residual: Tensor, free: float, usable: Tensor) -> Whitening:

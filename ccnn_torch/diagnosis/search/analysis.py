@@ -45,7 +45,7 @@ from ccnn_torch.diagnosis.search.convergence import (
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 from ccnn_torch.evidence.beam import search
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
-from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of, groups_of
 
 # Share of the rows at which the machine must be linearised about a set; else it is so about the nominal machine.
 _LINEARISED = 0.9
@@ -300,9 +300,8 @@ def _with_shared_noise(state: Analysis) -> Analysis:
         for members in sets:
             raw = [state.residual[..., None], *(atoms[i].columns for i in members)]
             target, *columns = _whitened(white, state.fitted, correlation, raw)
-            widths = [c.shape[-1] for c in columns]
-            groups = [*torch.split(torch.arange(sum(widths)), widths)] if widths else []
-            fit = fit_sets(grams_of(torch.cat([target[..., :0], *columns], -1), target[..., 0]), [groups], dof)
+            x = torch.cat([target[..., :0], *columns], -1)
+            fit = fit_sets(grams_of(x, target[..., 0]), [groups_of(columns)], dof)
             best = max(best, float(fit.log_evidence[0]) + sum(atoms[i].log_prior for i in members))
         return score + best
 

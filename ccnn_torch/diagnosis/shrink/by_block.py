@@ -15,13 +15,10 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.residual.rows import frame_columns
+from ccnn_torch.diagnosis.residual.whitening import ROUNDING
 from ccnn_torch.diagnosis.verdict.blocks import Blocks
-from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.evidence.shrink import HeldOut
-
-_BLOCKS = 5
-# Directions of the frames with less than this share of the largest one are rounding.
-_DIGITS = 1e-9
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of, groups_of
+from ccnn_torch.evidence.shrink import FOLDS, HeldOut
 
 
 def by_block(made: Blocks) -> dict[str, Any] | None:
@@ -39,14 +36,13 @@ def by_block(made: Blocks) -> dict[str, Any] | None:
     white, keep = analysis.whitening, analysis.whitening.keep()
     framed, fresh = white(analysis.fitted)[keep], white(frame_columns(analysis.situation, white.weight > 0))[keep]
     number = cut(analysis.situation.joints[keep], fresh)
-    if not members or not bool(torch.bincount(number, minlength=_BLOCKS).all()):
+    if not members or not bool(torch.bincount(number, minlength=FOLDS).all()):
         return None
     columns = torch.cat([white(atoms[i].columns) for i in members], -1)[keep]
-    widths = [atoms[i].columns.shape[-1] for i in members]
-    groups = torch.split(torch.arange(sum(widths)), widths)
+    groups = groups_of(atoms[i].columns for i in members)
     nominal, target = white(made.residual)[keep], white(analysis.residual)[keep]
     before, left, uncertain = nominal.clone(), target.clone(), torch.zeros_like(target)
-    for k in range(_BLOCKS):
+    for k in range(FOLDS):
         there = number == k
         before[there] = nominal[there] - fresh[there] @ _frames(fresh[~there])(nominal[~there])
         alone = _frames(framed[~there])
@@ -67,7 +63,7 @@ def by_block(made: Blocks) -> dict[str, Any] | None:
 
     def sizes(values: Tensor) -> list[float]:
         squares = values[:, channels].square().sum(-1)
-        return [float(squares[number == k].mean().sqrt()) for k in range(_BLOCKS)]
+        return [float(squares[number == k].mean().sqrt()) for k in range(FOLDS)]
 
     return {
         "unit": "m" if bool(made.position.any()) else "rad",
@@ -85,7 +81,7 @@ def by_block(made: Blocks) -> dict[str, Any] | None:
 
 def _frames(columns: Tensor) -> Callable[[Tensor], Tensor]:
     """Least-squares coefficients of frames' columns `s x c x r` for values `s x c` or `s x c x m`: `r` or `r x m`."""
-    inverse = torch.linalg.pinv(columns.flatten(0, 1), rtol=_DIGITS)
+    inverse = torch.linalg.pinv(columns.flatten(0, 1), rtol=ROUNDING)
     return lambda values: inverse @ values.flatten(0, 1)
 
 
@@ -106,5 +102,5 @@ def cut(joints: Tensor, frames: Tensor) -> Tensor:
     for group in shared.unique():
         mine = torch.nonzero(shared == group).squeeze(-1)
         order = mine[along[mine].argsort(stable=True)]
-        found[order] = torch.arange(len(mine)) * _BLOCKS // len(mine)
+        found[order] = torch.arange(len(mine)) * FOLDS // len(mine)
     return found

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.evidence.marginal_likelihood import fit_sets, without
-from ccnn_torch.evidence.shrink import RUNS, HeldOut
+from ccnn_torch.evidence.shrink import FOLDS, RUNS, HeldOut
 
-_FOLDS = 5
 # Updates of a fit to the first fold, and to the others.
 _UPDATES, _MORE = 5, 4
 
@@ -35,7 +34,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     order = sorted(range(len(sets)), key=lambda i: sum(map(len, groups[i])))
     parts = [order[i : i + 8] for i in range(0, len(order), 8)]
     reached: dict[int, tuple[Tensor, Tensor]] = {}
-    for k in range(_FOLDS):
+    for k in range(FOLDS):
         there = fold == k
         mine = x[there]
         rest = without(analysis.dictionary.grams, mine, y[there], used)
@@ -60,5 +59,5 @@ def folds(rows: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     run = max(1, rows // RUNS)
     blocks = -(-rows // run)
-    deal = torch.randperm(blocks, generator=generator) % _FOLDS
+    deal = torch.randperm(blocks, generator=generator) % FOLDS
     return deal.repeat_interleave(run)[:rows]
