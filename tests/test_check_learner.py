@@ -34,7 +34,16 @@ FACTORIES: dict[str, Callable[[], Learner]] = {
     "ccnn": lambda: CCNN(CCNNSettings(**SMALL)),
     "ccnn_without_bias": lambda: CCNN(CCNNSettings(**SMALL, bias=False, elites=3)),
     "ccnn_refined": lambda: CCNN(
-        CCNNSettings(**{**SMALL, "generations": 4, "refinement_iterations": 3, "refine_every": 2, "members": 2})
+        CCNNSettings(
+            **{
+                **SMALL,
+                "generations": 4,
+                "refinement_iterations": 2,
+                "refine_every": 2,
+                "members": 2,
+                "wave_searches": 1,
+            }
+        )
     ),
     "bp_lm": lambda: BPLM(BPLMSettings(hidden=(3,), restarts=2, iterations=5)),
     "bp_lm_at_rest": lambda: BPLM(BPLMSettings(hidden=(2, 3), restarts=1, iterations=8, tolerance=0.1, patience=1)),

@@ -65,7 +65,8 @@ def tripod_records(path: Path, rows: int = 160) -> torch.Tensor:
 
 def test_commands_of_a_parallel_mechanism(tmp_path: Path) -> None:
     tripod_records(tmp_path / "rows.csv")
-    found = calibrate(records=str(tmp_path / "rows.csv"), mechanism="tripod", geometry="identify", methods=["constant"])
+    keys = {"records": str(tmp_path / "rows.csv"), "mechanism": "tripod", "methods": ["constant"], "effects": "none"}
+    found = calibrate(**keys, geometry="identify")
     found.save(tmp_path, forms=())
     pose = found.results["pose"]["position"]
     assert pose["after"]["rms"]["median"] < 0.4 * pose["before"]["rms"]["median"]
@@ -104,7 +105,7 @@ def test_the_remainder_is_what_the_identified_machine_leaves(tmp_path: Path) -> 
 
 def test_before_in_the_figures_is_before_the_geometry_too(tmp_path: Path) -> None:
     tripod_records(tmp_path / "rows.csv")
-    keys = {"records": str(tmp_path / "rows.csv"), "mechanism": "tripod", "geometry": "identify"}
+    keys = {"records": str(tmp_path / "rows.csv"), "mechanism": "tripod", "geometry": "identify", "effects": "none"}
     config = RunConfig.from_keys(
         **keys, methods=["constant"], out=str(tmp_path / "r"), save_models=False, save_report=False
     )

