@@ -266,7 +266,7 @@ def compensate_table(
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     poses = WantedPoses(loaded, allow_code, tool, base) if pose else None
     found = write_compensated(loaded, input, output, poses, back, sd)
-    said = sentences(output, found, trained=loaded.machine is None)
+    said = sentences(output, found, loaded)
     if poses is not None and poses.chooses:
         said.append(poses.sentence)
     refused = (
@@ -373,12 +373,16 @@ def _count(result: Compensated, table: Table, found: dict[str, Array], back: boo
     result.damped += int((found["ideal_status" if back else "status"] == DAMPED).sum())
 
 
-def sentences(output: Path, found: Compensated, trained: bool) -> list[str]:
+def sentences(output: Path, found: Compensated, model: LoadedModel) -> list[str]:
     """What was written, and how many rows are outside the domain or damped."""
     said = [f"{output}: {found.rows} rows written."]
     if found.outside:
-        what = "what was measured" if trained else "the joints of the identified machine"
-        then = "what was learned fades there, geometry and effects hold" if trained else "its geometry holds there too"
+        what, then = "what was measured", "what was learned fades there, geometry and effects hold"
+        if model.machine is not None:
+            # The file of geometry alone does not say where it was measured.
+            measured = len(model.machine.joints) > 0
+            what = what if measured else "the joints of the identified machine"
+            then = "geometry and effects hold there too" if measured else "its geometry holds there too"
         said.append(f"{found.outside} of them {_is(found.outside)} outside {what} (inside_domain = 0): {then}.")
     if found.damped:
         said.append(

@@ -15,7 +15,7 @@ from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.compensation import load_compensation
-from ccnn_torch.compensation.job import WantedPoses
+from ccnn_torch.compensation.job import WantedPoses, compensate_table
 from ccnn_torch.compensation.model_files.identified import model_of_machine
 from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
 from ccnn_torch.effects.found_machine import FoundMachine
@@ -57,6 +57,17 @@ def test_its_commands_bring_the_machine_to_the_nominal_pose(found: Path) -> None
     torch.testing.assert_close(pose[exact], wanted[exact], rtol=0, atol=5e-7)
     with pytest.raises(InputError, match=r"needs the covariates .*direction1"):
         model(region.joints.numpy())
+
+
+def test_it_says_that_rows_are_outside_what_was_measured(found: Path, tmp_path: Path) -> None:
+    model = load_compensation(found)
+    low, high = model.region.T
+    # The middle of the region, and beyond its end.
+    rows = torch.from_numpy((low + high) / 2 + torch.tensor([[0.0], [0.6]]).numpy() * (high - low))
+    columns = {c.header: rows[:, i].numpy() for i, c in enumerate(model.joints)}
+    write_table(tmp_path / "in.csv", columns | {c.header: [1.0, 1.0] for c in model.covariates})
+    said, _ = compensate_table(found, tmp_path / "in.csv", tmp_path / "out.csv")
+    assert said[1] == "1 of them is outside what was measured (inside_domain = 0): geometry and effects hold there too."
 
 
 def test_it_is_a_mechanism(found: Path) -> None:
