@@ -89,6 +89,9 @@ _COEFFICIENTS = (
 class Instrument(Effect):
     """Δposition = S (position - middle of the workspace) + z, S symmetric: no rigid motion but by what is secondary.
 
+    The position is what the device shows, where that is known: what it shows as constant it has not scaled, whatever
+    the machine did.
+
     The diagonal of S are errors of scale, beside it is half the angle by which two axes are not square. Secondary:
     lean, the other half, a turn, since the device aligns one of the two axes with the machine and not their bisector;
     z, since its own zero is not the middle of the workspace; and a scale of the measured angles where the machine's
@@ -112,6 +115,9 @@ def _instrument_columns(situation: Situation) -> Tensor:
     """`... x s x c x 15`, columns as in `_COEFFICIENTS`."""
     mechanism = situation.mechanism
     position, rotation = situation.platform
+    if situation.guess is not None:
+        shown = mechanism.frame(situation.guess)[0]
+        position = torch.where(torch.isfinite(shown).all(-1, keepdim=True), shown, position)
     from_middle = position - mechanism.frame(mechanism.home_pose)[0]
     shear = [torch.zeros_like(from_middle) for _ in _PAIRS]
     for column, (i, j) in zip(shear, _PAIRS, strict=True):
