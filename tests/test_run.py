@@ -196,8 +196,10 @@ def test_a_config_changed_between_kill_and_resume_is_refused(
 def test_records_changed_between_kill_and_resume_are_refused(tmp_path: Path) -> None:
     records = tripod_records(tmp_path / "rows.csv")
     run = tmp_path / "run"
-    base = {"case": None, "records": str(records), "mechanism": "tripod", "methods": ["constant"], "geometry": "none"}
-    RUN.start(short(**base, out=str(run), save_models=False, save_report=False), quiet=True)
+    base = {"case": None, "records": str(records), "mechanism": "tripod", "methods": ["constant"]}
+    RUN.start(
+        short(**base, geometry="none", effects="none", out=str(run), save_models=False, save_report=False), quiet=True
+    )
     (run / "results.json").unlink()
     lines = records.read_text().splitlines()
     # A row held out from training: no checkpoint would miss it.
