@@ -21,7 +21,7 @@ from ccnn_torch.mechanisms import PoseError, load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import write_table
 from ccnn_torch.report.json_files import plain
-from ccnn_torch.verification.promise import configurations, paired_gain, promise_block, promised
+from ccnn_torch.verification.promise import configurations, paired_gain, promise_block, promised, repeated
 
 Cli = Callable[..., tuple[int, str, str]]
 DELTA = "delta"
@@ -228,3 +228,38 @@ def test_rows_at_one_configuration_count_once() -> None:
     assert block is not None and block["configurations"] == 5 and block["rows"] == 150
     assert not paired_gain(of_place, 0.999 * of_place[torch.randperm(150, generator=generator)], groups)
     assert paired_gain(of_place, 0.1 * of_place, groups)
+
+
+def test_targets_that_were_reached_again_have_accuracy_and_repeatability() -> None:
+    """Against the formulas of ISO 9283:1998, 7.2.1 and 7.2.2, target by target."""
+    rng = np.random.default_rng(0)
+    groups = np.repeat([0, 1, 2], [30, 20, 2])
+    off = np.array([[3e-4, 0, 0], [0, 4e-4, 0], [0, 0, 9e-4]])
+    gap = off[groups] + 2e-5 * rng.standard_normal((52, 3))
+    place = rng.standard_normal((3, 3))[groups] + gap
+    tensors = [torch.from_numpy(v) for v in (place, gap, gap - off[groups], groups)]
+    found = repeated(*tensors)
+    assert found is not None and (found.targets, found.cycles) == (2, 20)
+    expected = []
+    for k in (0, 1):
+        mine = place[groups == k]
+        length = np.sqrt(((mine - mine.mean(0)) ** 2).sum(1))
+        expected.append(length.mean() + 3 * np.sqrt(((length - length.mean()) ** 2).sum() / (len(mine) - 1)))
+    assert found.repeatability.max == pytest.approx(max(expected), rel=1e-12)
+    assert found.accuracy.max == pytest.approx(4e-4, rel=0.03)
+    assert found.accuracy.median == pytest.approx(3.5e-4, rel=0.03)
+    assert found.accuracy_after.max < 1.5e-5
+    assert repeated(*(t[50:] for t in tensors[:3]), torch.zeros(2, dtype=torch.int64)) is None
+
+
+def test_verify_tells_the_repeatability_of_repeated_targets(tmp_path: Path, model: Path, cli: Cli) -> None:
+    joints = wanted(5, 6).repeat(5, 1)
+    records = delta_rows(tmp_path / "cycles.csv", 5, joints=joints)
+    code, _, err = cli("verify", model, records, "--mechanism", DELTA, "--out", tmp_path / "v")
+    assert code in (0, 1), err
+    again = json.loads((tmp_path / "v" / "verify.json").read_text())["repeated"]
+    assert (again["targets"], again["cycles"]) == (6, 5)
+    # Chi with three degrees: 1.60 + 3 x 0.67 times the noise of a coordinate; fewer for means of five.
+    assert 1.5 * NOISE < again["repeatability"]["median"] < 5 * NOISE
+    assert again["accuracy_after"]["median"] < 0.1 * again["accuracy"]["median"]
+    assert "Targets that were reached again" in (tmp_path / "v" / "verify.html").read_text()

@@ -24,13 +24,14 @@ from ccnn_torch.verification.prediction import (
     Motion,
     Rows,
     fit_motion,
+    gaps,
     judge,
     mapped_columns,
     nominal_mechanism,
     predict,
     pseudoerror_settings,
 )
-from ccnn_torch.verification.promise import configurations, paired_gain, promise_of, promised
+from ccnn_torch.verification.promise import configurations, paired_gain, promise_of, promised, repeated
 
 # A moved measuring frame is suspected if correcting it halves the remaining RMS error at least.
 _SUSPECT = 0.5
@@ -105,6 +106,7 @@ def verify_model(
         frames="fitted again" if refit_frames else "the model's",
         position=position,
         rotation=rotation,
+        repeated=repeated(*gaps(rows, compensated, motions), groups),
         joints={
             c.name: JointError(unit=c.unit, before=rms_of(measured[usable, k]), after=rms_of(left[usable, k]))
             for k, c in enumerate(machine.joints)

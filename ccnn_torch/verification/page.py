@@ -94,7 +94,24 @@ def verify_tables(results: VerifyResults) -> list[Table]:
         cells = [number_text(None if block[w] is None else block[w] / scale) for w in ("before", "after")]
         joints.append((f"{name} [{unit}]", *cells))
     about = "RMS, at the commanded joints; rows near singular poses or out of reach are left out."
-    return [pose, Table("Deviation of each joint", ("joint", "before", "after"), joints, about)]
+    tables = [pose, Table("Deviation of each joint", ("joint", "before", "after"), joints, about)]
+    again = results.repeated
+    if again is not None:
+        scale, unit = display_unit("m", again.accuracy.median)
+        lines = [
+            (f"{words} [{unit}]", *(number_text(value / scale) for value in (found.median, found.max)))
+            for words, found in (
+                ("accuracy AP before", again.accuracy),
+                ("accuracy AP after", again.accuracy_after),
+                ("repeatability RP", again.repeatability),
+            )
+        ]
+        note = (
+            f"ISO 9283, position: {count_text(again.targets, 'target')} with {again.cycles} readings or more. RP is "
+            "the mean distance from the target's own mean and three standard deviations; no model makes it smaller."
+        )
+        tables.append(Table("Targets that were reached again", ("", "median", "largest"), lines, note))
+    return tables
 
 
 def _left(block: Error, kind: str) -> str:

@@ -13,7 +13,14 @@ from torch import Tensor
 
 from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, load_mechanism, mechanism_from_description
+from ccnn_torch.mechanisms import (
+    Mechanism,
+    PoseError,
+    SerialArm,
+    as_measured,
+    load_mechanism,
+    mechanism_from_description,
+)
 from ccnn_torch.mechanisms.frames.fit import rigid_body_frame
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.plugins import code_refused
@@ -88,9 +95,7 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
     ideal = torch.from_numpy(np.asarray(found["ideal"]))
     nominal = machine.forward_kinematics(records.joints, guess=pose)
     if model.machine is not None:
-        real = model.machine.identified
-        if isinstance(real, SerialArm) and len(machine.pose) == 3:
-            real = real.with_orientation("none")
+        real = as_measured(model.machine.identified, machine.pose)
         predicted = real.forward_kinematics(records.joints, guess=pose)
     else:
         predicted = machine.forward_kinematics(ideal, guess=pose)
@@ -139,6 +144,15 @@ def judge(
     # Beside the frames that the model's deviation was found with, or those that suit the model best.
     found = joint_deviations(machine, rows.joints, last, **settings)
     return before, after, found.deviation, found.deviation - rows.deviation, found.usable
+
+
+def gaps(rows: Rows, compensated: bool, motions: list[Motion]) -> tuple[Tensor, Tensor, Tensor]:
+    """Measured positions, and from where they should be to where they are before and after, `s x 3` each [m]."""
+    machine = rows.mechanism
+    nominal, predicted = (machine.frame(pose)[0] for pose in (rows.nominal, rows.predicted))
+    first, last = (machine.frame(motion.undone(machine, rows.pose))[0] for motion in motions)
+    before, after = (predicted - nominal, first - nominal) if compensated else (first - nominal, last - predicted)
+    return first, before, after
 
 
 # Weight of orientation against position [m/rad], as in fits of an arm's frames.

@@ -15,13 +15,37 @@ from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.report.json_files import read_json
-from ccnn_torch.report.results.verify import Promised
+from ccnn_torch.report.results.verify import Middle, Promised, Repeated
 
 # Rows whose commanded joints round to the same cell are one configuration, measured several times [SI].
 _CELL = {"m": 1e-4, "rad": 1e-3}
 # Squared length of independent normal errors in three directions: variance over squared mean.
 _LEAST_SPREAD = 2 / 3
 _SHARE = 0.95
+# Readings of a target from which its spread is told.
+_CYCLES = 3
+
+
+def repeated(place: Tensor, before: Tensor, after: Tensor, groups: Tensor) -> Repeated | None:
+    """Pose accuracy AP and repeatability RP of the position (ISO 9283:1998, 7.2.1 and 7.2.2).
+
+    Args:
+        place: measured positions, `s x 3` [m].
+        before, after: from where a position should be to where it is, `s x 3` [m].
+        groups: number of each row's target, `s`.
+
+    Returns:
+        Figures over the targets that were reached three times or more; None where none was.
+    """
+    chosen = [groups == k for k in torch.nonzero(torch.bincount(groups) >= _CYCLES).squeeze(-1).tolist()]
+    if not chosen:
+        return None
+    away = [(place[mine] - place[mine].mean(0)).norm(dim=-1) for mine in chosen]
+    spread = [float(a.mean() + 3 * a.std()) for a in away]
+    accuracy, left = ([float(gap[mine].mean(0).norm()) for mine in chosen] for gap in (before, after))
+    ap, ap_after, rp = (Middle(median=float(np.median(v)), max=max(v)) for v in (accuracy, left, spread))
+    cycles = min(len(a) for a in away)
+    return Repeated(targets=len(chosen), cycles=cycles, accuracy=ap, accuracy_after=ap_after, repeatability=rp)
 
 
 def configurations(joints: Tensor, coordinates: Sequence[Coordinate]) -> Tensor:

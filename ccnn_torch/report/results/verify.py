@@ -12,6 +12,11 @@ class Size(Result):
     max: float
 
 
+class Middle(Result):
+    median: float
+    max: float
+
+
 class Promised(Result):
     rms: float
     low: float
@@ -31,6 +36,21 @@ class JointError(Result):
     after: Number
 
 
+class Repeated(Result):
+    """Accuracy and repeatability of poses (ISO 9283:1998, 7.2), of the targets that were reached three times or more;
+    beside each the median and the largest over them."""
+
+    targets: int
+    cycles: int
+    """readings of the target that has the fewest"""
+    accuracy: Middle
+    """AP: distance of the mean position from the commanded one, without the model"""
+    accuracy_after: Middle
+    """the same with it"""
+    repeatability: Middle
+    """RP: mean distance of a reading from the mean of its target, and three standard deviations of it"""
+
+
 class VerifyResults(Result):
     """verify.json: a model judged on rows that it has never seen. SI units. null = not known."""
 
@@ -47,6 +67,8 @@ class VerifyResults(Result):
     frames: Literal["the model's", "fitted again"]
     position: Error
     rotation: Error | None
+    repeated: Repeated | None = None
+    """null where no target was reached three times"""
     joints: dict[str, JointError]
     """RMS of each joint's deviation; null where no row has one"""
     kept: bool
