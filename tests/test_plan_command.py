@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -143,3 +146,33 @@ def test_an_arm_is_planned_for_what_poses_can_tell(cli: Cli, tmp_path: Path) -> 
     for text in (told.replace("\n", " "), out.with_suffix(".md").read_text()):
         assert "No pose distinguishes: base_z and d1 only as 1.00 base_z + 1.00 d1;" in text
         assert "theta6 and tool_rz only as" in text
+
+
+@pytest.mark.parametrize(
+    ("language", "suffix", "move"),
+    [
+        ("krl", ".src", r"PTP \{(.*)\}"),
+        ("rapid", ".mod", r"MoveAbsJ \[\[(.*?)\]"),
+        ("urscript", ".script", r"movej\(\[(.*)\],"),
+        ("gcode", ".ngc", r"G1 (.*) F600"),
+    ],
+)
+def test_planned_poses_are_a_robot_program_too(cli: Cli, tmp_path: Path, language: str, suffix: str, move: str) -> None:
+    """Joints as the controller counts them, in degrees: a Fanuc-like third joint counts from the horizontal."""
+    arm = Path(__file__).parents[1] / "experiments" / "data" / "ur10.yaml"
+    out = tmp_path / "7 plan; x.csv"
+    words = ["candidates=300", f"program={language}", 'joint_map={q3: "q3 - q2"}']
+    code, _, err = cli("plan", "--mechanism", arm, "--poses", 12, "--out", out, *words)
+    assert code == 0, err
+    text = out.with_suffix(suffix).read_text()
+    # A stranger's file name is no code.
+    assert ";" not in text.splitlines()[0] and "p_7_plan__x" in text
+    numbers = [[float(n) for n in re.findall(r"-?\d+\.\d{4}", m)] for m in re.findall(move, text)]
+    with out.open(newline="") as file:
+        rows = [{name.partition("[")[0]: float(v) for name, v in row.items()} for row in csv.DictReader(file)]
+    assert len(numbers) == len(rows) == 12
+    for shown, row in zip(numbers, rows, strict=True):
+        q = [math.degrees(row[f"q{k}"]) for k in range(1, 7)]
+        assert shown[:6] == pytest.approx([q[0], q[1], q[2] + q[1], *q[3:]], abs=1e-4)
+    code, _, err = cli("plan", "--mechanism", "delta", "--poses", 30, "--out", tmp_path / "d.csv", "program=urscript")
+    assert code == 2 and "urscript takes six joints that turn, and the machine has 3" in err

@@ -128,8 +128,8 @@ def plan(
     OUT.csv has a row for each pose: the joints to command, q1[unit]…, and the pose at which they bring the nominal
     machine, the most informative ones first. The page beside it gives the gain of each further pose. Keys: mechanism,
     mechanism_keys, columns, joint_map, parameters.free, .fixed, .tied, .prior, residual, noise, joint_noise,
-    candidates, limits, max_condition, rotation_weight, per_leg, repeat, least_gain, margin, seed. Sizes are in SI, or
-    texts with a unit.
+    candidates, limits, max_condition, rotation_weight, per_leg, repeat, least_gain, margin, program, seed. Sizes are in
+    SI, or texts with a unit. program=krl, rapid, urscript or gcode writes the moves as a robot program's skeleton, too.
 
     Examples:
 

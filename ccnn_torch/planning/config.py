@@ -68,4 +68,8 @@ class PlanConfig(JobConfig):
         ge=0,
         description="poses stay in reach of machines whose parameters are off by so many plausible errors",
     )
+    program: Literal["krl", "rapid", "urscript", "gcode"] | None = Field(
+        default=None,
+        description="write the skeleton of a robot program, too: krl (KUKA), rapid (ABB), urscript or gcode",
+    )
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the candidates")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,9 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.planning import Plan, plan_poses
 from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.planning.page import plan_page, plan_plot
+from ccnn_torch.planning.program import program_text
 from ccnn_torch.records import write_table
-from ccnn_torch.records.joint_map import read_joint_map
+from ccnn_torch.records.joint_map import JointMap, read_joint_map
 from ccnn_torch.report.figures.style import inline_svg, save_figure
 from ccnn_torch.report.page import InlineFigure, Section
 from ccnn_torch.units import from_si, split_header
@@ -47,6 +47,9 @@ def make_plan(
     if poses < 1:
         raise InputError(f"--poses: plan at least 1 pose, not {poses}")
     machine = load_mechanism(mechanism, **config.mechanism_keys) if isinstance(mechanism, str) else mechanism
+    if config.program is not None:
+        # Refused before minutes are spent.
+        program_text(config.program, "", np.zeros((0, len(machine.joints))), machine.joints)
     wanted = config.parameters
     prior = prior_sizes(wanted.prior, machine.geometry, "parameters.prior")
     plans = plan_poses(
@@ -83,7 +86,7 @@ def write_plan(
 
     The CSV has a row for each pose: `leg[1]` where each leg has its own, the joints to command, and the pose at which
     they bring the nominal machine; the most informative rows come first. With a `joint_map` of the config the joints
-    stand there as the controller counts them, too, as `command_q1[unit]` ….
+    stand there as the controller counts them, too, as `command_q1[unit]` …. A `program` is written beside it.
 
     Returns:
         The files.
@@ -98,7 +101,14 @@ def write_plan(
     for coordinates, part in ((mechanism.joints, "joints"), (mechanism.pose, "pose")):
         values = torch.cat([getattr(plan, part) for plan in plans])
         columns |= {c.header: values[:, i].numpy() for i, c in enumerate(coordinates)}
-    columns |= _commands(columns, mechanism, config or PlanConfig.from_file(None))
+    config = config or PlanConfig.from_file(None)
+    counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
+    joints = np.stack([columns[joint.header] for joint in mechanism.joints], -1)
+    shown = joints if counted is None else counted.shown(joints)
+    columns |= {} if counted is None else _commands(shown, counted, mechanism, config)
+    program = None
+    if config.program is not None:
+        program, suffix = program_text(config.program, path.stem, shown, mechanism.joints)
     make_folder(path.parent)
     write_table(path, columns)
     plot = plan_plot(mechanism.pose, plans, least_gain)
@@ -107,17 +117,17 @@ def write_plan(
     linked = Section(sentences=[f"![{plot.caption}]({png.name})", plot.caption])
     page, text = path.with_suffix(".html"), path.with_suffix(".md")
     write_whole(text, plan_page(mechanism.name, plans, least_gain, [linked]).markdown())
-    shown = plan_page(mechanism.name, plans, least_gain, [Section(figures=[drawn])])
-    write_whole(page, shown.html([path.name, text.name]))
-    return [path, page, text, png, svg]
+    drawn_page = plan_page(mechanism.name, plans, least_gain, [Section(figures=[drawn])])
+    write_whole(page, drawn_page.html([path.name, text.name]))
+    files = [path, page, text, png, svg]
+    if program is not None:
+        files.append(path.with_suffix(suffix))
+        write_whole(files[-1], program)
+    return files
 
 
-def _commands(columns: Mapping[str, Array], mechanism: Mechanism, config: PlanConfig) -> dict[str, Array]:
-    """The joints as the controller counts them, in the units of its columns; nothing where it counts no other way."""
-    counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
-    if counted is None:
-        return {}
-    shown = counted.shown(np.stack([columns[joint.header] for joint in mechanism.joints], -1))
+def _commands(shown: Array, counted: JointMap, mechanism: Mechanism, config: PlanConfig) -> dict[str, Array]:
+    """The joints as the controller counts them, `s x n` [SI], in the units of its columns."""
     units = dict(split_header(target) for target in config.columns.values())
     found = {}
     for k, (joint, column) in enumerate(zip(mechanism.joints, counted.columns, strict=True)):
