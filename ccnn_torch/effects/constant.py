@@ -11,7 +11,7 @@ from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.effects.columns import TWIST, caused_by, own_parameters, parameter_columns, shown_columns, twist_columns
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import Situation
-from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms import Mechanism, Partial, SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
 _SCALE = {"m": 1e-3, "rad": 1e-3}
@@ -56,7 +56,8 @@ class Tool(Effect):
         """A platform that turns, and a tool frame that is known; an unknown one is fitted before anything else."""
         if "tool" in getattr(mechanism, "unknown_frames", ()):
             return f"a known tool frame: that of {mechanism.name} is fitted to the records anyhow"
-        if not isinstance(mechanism, SerialArm) and mechanism.frame(mechanism.home_pose)[1] is None:
+        whole = mechanism.mechanism if isinstance(mechanism, Partial) else mechanism
+        if not isinstance(whole, SerialArm) and whole.frame(whole.home_pose)[1] is None:
             return "a platform that turns: on this one a shift of the tool is a shift of the frame"
         return ""
 

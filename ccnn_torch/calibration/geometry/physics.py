@@ -113,6 +113,10 @@ class Physics:
             InputError, MethodFailedError: see `machine_parts`.
         """
         there = _rows(self.situations[repeat], rows)
+        # Commands are for whole poses, whatever of them was measured; but of a tool that was seen in part the rest is
+        # not known.
+        same = (len(a.effect.coefficients(there.whole)) == len(a.coefficients) for a in self.acting[repeat])
+        there = there.whole if all(same) else there
         return machine_parts(there, self.acting[repeat], self.values[repeat, 0], covariates, margin)
 
     def block(self) -> dict[str, dict[str, Values]]:

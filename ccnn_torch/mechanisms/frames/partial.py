@@ -91,8 +91,9 @@ class Partial(Mechanism):
         return self.mechanism.forward_kinematics(joints, parameters, near)[..., self.seen]
 
     def frame(self, pose: Tensor) -> Frame:
-        """The mechanism's frame where all that is not seen is as in the home pose."""
-        return self.mechanism.frame(self.filled(pose))
+        """The mechanism's frame where all that is not seen is as in the home pose; no rotation where no angle is."""
+        position, rotation = self.mechanism.frame(self.filled(pose))
+        return position, rotation if any(c.unit == "rad" for c in self.pose) else None
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Joints nearest to the guess whose pose has these coordinates, `... x n` [SI]; differentiable."""
