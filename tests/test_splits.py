@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 from ccnn_torch.config.split import HeldOutConfig, held_out_notes
+from ccnn_torch.diagnosis.shrink.held_out import folds
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.splits import Split, fold_splits, split_rows
 
@@ -47,6 +48,8 @@ def test_readings_of_one_target_are_held_out_together() -> None:
     ]
     for fold in fold_splits(split, "random", 3, 0):
         assert not set(targets[fold.train, 0].tolist()) & set(targets[fold.validation, 0].tolist())
+    dealt = folds(targets, 0)
+    assert len(set(zip(targets[:, 0].tolist(), dealt.tolist(), strict=True))) == 12 and len(dealt.unique()) == 5
     # Every row another target, or too few of them: rows are drawn as ever.
     for other in (torch.arange(60.0)[:, None], torch.arange(60)[:, None] % 3):
         alone = split_rows(torch.zeros(60, 3), test=0.25, validation=0.2, seed=1, targets=other)

@@ -42,7 +42,8 @@ DEFAULT_BY = "position:5mm"
 
 # Values that a sentence lists.
 _FEW = 8
-_FEWEST_TARGETS = 5
+# Joints are the same to this share of their range; fewer targets than this are not dealt to parts.
+_SAME_TARGET, _FEWEST_TARGETS = 1e-6, 5
 _FOLDS = 1
 """Beside the seed of a repeat, so that folds are not drawn like the split."""
 
@@ -117,7 +118,8 @@ def split_rows(
     if kind == "random":
         if by is not None:
             raise InputError(f"split.by: '{by}' has no meaning with split.kind=random; write split.kind=group")
-        places = None if targets is None else number_targets(targets)
+        shared = None if targets is None else number_targets(targets)
+        places = None if shared is None else shared.numpy()
         if isinstance(test, Tensor):
             return _hold_out(test.numpy(), places, validation, seed)
         if places is None:
@@ -131,13 +133,14 @@ def split_rows(
     return _block(positions.numpy(), groups, test, validation)
 
 
-def number_targets(joints: Tensor) -> _Integers | None:
-    """Number of each row's target, `rows`: rows of the same joints `rows x n` share one. None where no two do.
+def number_targets(joints: Tensor, fewest: int = _FEWEST_TARGETS) -> Tensor | None:
+    """Number of each row's target, `rows`: rows of the same joints `rows x n` share one.
 
-    Targets too few to be dealt to parts are none: then every row is one of its own.
+    None where no two do, or there are fewer targets than `fewest`: then every row is one of its own.
     """
-    places = np.unique(joints.numpy(), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
-    return places if _FEWEST_TARGETS <= places.max(initial=0) + 1 < len(places) else None
+    spread = (joints.amax(0) - joints.amin(0)).clamp_min(1e-300)
+    number: Tensor = torch.unique((joints / (spread * _SAME_TARGET)).round(), dim=0, return_inverse=True)[1]
+    return number if fewest <= int(number.max()) + 1 < len(number) else None
 
 
 def fold_splits(split: Split, kind: str, folds: int, seed: int) -> list[Split]:

@@ -85,7 +85,7 @@ def remaining_gain(
     white = analysis.whitening
     position = white.channels < 3
     channels = position if bool(position.any()) else ~position
-    fold = folds(len(white.keep()), seed)
+    fold = folds(analysis.situation.joints[white.keep()], seed)
     rows = torch.arange(len(fold))
     most = min(_ROWS, _VALUES // len(analysis.situation.mechanism.joints))
     if len(rows) > most:

@@ -14,11 +14,10 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects import Situation
+from ccnn_torch.records.splits import number_targets
 
 # Targets from which it can be seen what their readings share.
-_FEWEST_TARGETS = 8
-# Joints that differ by less than this share of their range are of one target.
-_SAME_TARGET = 1e-6
+FEWEST_TARGETS = 8
 # Correlations from row to row, and shares of the variance that readings of a target have in common.
 _FROM_ROW, _IN_TARGET = (0.3, 0.6, 0.8, 0.9, 0.95, 0.98), (0.2, 0.5, 0.8, 0.9, 0.95, 0.99)
 # The same of a device that drifts and scatters, with the share of the variance that is of each row alone; and the rows
@@ -93,13 +92,6 @@ def _factor(rows: int, value: float, alone: float) -> Tensor:
     return factor
 
 
-def targets_of(joints: Tensor) -> Tensor | None:
-    """Number of each row's target, `s`: rows of equal joints `s x n`; None where each has its own, or there are few."""
-    spread = (joints.amax(0) - joints.amin(0)).clamp_min(1e-300)
-    number = torch.unique((joints / (spread * _SAME_TARGET)).round(), dim=0, return_inverse=True)[1]
-    return number if _FEWEST_TARGETS <= int(number.max()) + 1 < len(number) else None
-
-
 def possible_correlations(situation: Situation, keep: Tensor) -> list[Correlation]:
     """What may be: independent rows first.
 
@@ -107,7 +99,7 @@ def possible_correlations(situation: Situation, keep: Tensor) -> list[Correlatio
         situation: all rows.
         keep: those that count, in the order measured.
     """
-    target = targets_of(situation.joints[keep])
+    target = number_targets(situation.joints[keep], FEWEST_TARGETS)
     found = [INDEPENDENT, *(Correlation(value) for value in _FROM_ROW)]
     if len(keep) <= _MOST_ROWS:
         found += [Correlation(value, alone=alone) for value in _DRIFTS for alone in _SCATTERS]

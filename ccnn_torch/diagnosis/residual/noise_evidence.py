@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.residual.correlation import targets_of
+from ccnn_torch.diagnosis.residual.correlation import FEWEST_TARGETS
 from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.records import Records
+from ccnn_torch.records.splits import number_targets
 from ccnn_torch.units import si_unit_of
 
 # Readings beyond the first of their target that make an estimate.
@@ -47,7 +48,7 @@ def noise_of_repeats(situation: Situation, measured: Tensor) -> Noise | None:
     held = [v[:, None] for name, v in situation.covariates.items() if name not in _FREE]
     residual = pose_residual(situation, measured)
     fine = torch.isfinite(residual).all(-1)
-    target = targets_of(torch.cat([situation.joints, *held], -1)[fine])
+    target = number_targets(torch.cat([situation.joints, *held], -1)[fine], FEWEST_TARGETS)
     if target is None:
         return None
     count = torch.bincount(target)

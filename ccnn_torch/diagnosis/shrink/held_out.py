@@ -10,6 +10,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.evidence.marginal_likelihood import fit_sets, without
 from ccnn_torch.evidence.shrink import FOLDS, RUNS, HeldOut
+from ccnn_torch.records.splits import number_targets
 
 # Updates of a fit to the first fold, and to the others.
 _UPDATES, _MORE = 5, 4
@@ -18,13 +19,14 @@ _UPDATES, _MORE = 5, 4
 def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> list[HeldOut]:
     """Refit every set of atoms on four fifths of the rows, five times, each for the fifth that is left.
 
-    Rows are dealt to the folds in runs of neighbours, at random: neighbours in time share more than others do.
+    Rows are dealt to the folds in runs of neighbours, at random: neighbours in time share more than others do. Where
+    rows repeat targets these are dealt whole: a target that was fitted to is no new one.
     """
     keep = analysis.whitening.keep()
     x, y = analysis.dictionary.columns, analysis.dictionary.y
     # What is left of a row is that of the row itself, whatever it shares with others.
     plain_x, plain_y = analysis.plain
-    fold = folds(len(keep), seed)
+    fold = folds(analysis.situation.joints[keep], seed)
     weight = analysis.whitening.weight[keep].sqrt()[:, None]
     sigma = analysis.whitening.sigma
     left = [y.clone() for _ in sets]
@@ -54,9 +56,13 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     ]
 
 
-def folds(rows: int, seed: int) -> Tensor:
-    """Fold of each row."""
-    generator = torch.Generator().manual_seed(seed)
+def folds(joints: Tensor, seed: int) -> Tensor:
+    """Fold of each row of commanded joints `s x n`."""
+    generator, rows = torch.Generator().manual_seed(seed), len(joints)
+    target = number_targets(joints)
+    if target is not None:
+        deal: Tensor = torch.randperm(int(target.max()) + 1, generator=generator) % FOLDS
+        return deal[target]
     run = max(1, rows // RUNS)
     blocks = -(-rows // run)
     deal = torch.randperm(blocks, generator=generator) % FOLDS
