@@ -95,6 +95,11 @@ class Coupling(Effect):
         found += [Coefficient(f"{j.name} zero", j.unit, ZERO[j.unit], joint=j.name, secondary=True) for j in joints]
         return tuple(found)
 
+    def parts(self, situation: Situation) -> list[list[int]]:
+        """Numbers of the coefficients of each pair, one screw, belt or gear, with the zero of what it moves."""
+        n = len(situation.mechanism.joints)
+        return [[k, n * (n - 1) + k // (n - 1)] for k in range(n * (n - 1))]
+
     def counted_from(self, situation: Situation) -> dict[str, int]:
         """As of `JointGain`: the joint that moves the other one."""
         joints = situation.mechanism.joints

@@ -16,6 +16,7 @@ from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.rows import only_usable
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
+from ccnn_torch.effects.joints import Coupling
 from ccnn_torch.evidence.marginal_likelihood import GroupProducts, Prior, fit_single_groups, own_products
 from ccnn_torch.evidence.priors import EFFECT
 
@@ -205,7 +206,7 @@ class _Choice:
 
     def wider(self) -> list[list[int]]:
         """What is chosen with each of the parts."""
-        return [sorted(self.chosen + p) if not set(p) <= set(self.chosen) else p for p in self.parts]
+        return [sorted({*self.chosen, *p}) if not set(p) <= set(self.chosen) else p for p in self.parts]
 
     def take(self, evidence: Tensor) -> None:
         """The best of `wider`, whose log evidences these are, where it is worth the choice."""
@@ -277,8 +278,10 @@ def _with(atom: Atom, chosen: list[int], charge: float) -> Atom:
 
 
 def _parts(situation: Situation, atom: Atom) -> list[list[int]]:
-    """Numbers of the coefficients of each joint or leg."""
+    """Numbers of the coefficients of each joint or leg, or of what the effect says that its parts are."""
     assert atom.effect is not None
+    if isinstance(atom.effect, Coupling):
+        return atom.effect.parts(situation)
     found: dict[int | str, list[int]] = {}
     for k, c in enumerate(atom.effect.coefficients(situation)):
         owner = c.joint if c.leg is None else c.leg
