@@ -15,7 +15,7 @@ from sklearn.linear_model import BayesianRidge
 from benchmarks.measure import Row, compare
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.effects import Situation, default_gravity
-from ccnn_torch.evidence.single_groups import fit_single_groups, own_products
+from ccnn_torch.evidence.marginal_likelihood import fit_single_groups, own_products
 from ccnn_torch.simulation.job import simulate_records
 
 NOISE = 1e-5

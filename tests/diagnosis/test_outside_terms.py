@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from ccnn_torch.evidence.single_groups import NO_COLUMNS, fit_single_groups, own_products
 from diagnosis._machines import NOISE, acting, reached_with, rows_of
 from diagnosis.test_convergence import columns, looked_at
 from torch import Tensor
@@ -14,6 +13,7 @@ from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.diagnosis.residual.noise_evidence import noise_of_repeats
 from ccnn_torch.effects import Situation
 from ccnn_torch.evidence.dictionary import gain_beside
+from ccnn_torch.evidence.marginal_likelihood import NO_COLUMNS, Prior, fit_single_groups, own_products
 
 
 def measured(situation: Situation, change: Tensor, times: float, seed: int) -> Tensor:
@@ -95,7 +95,7 @@ def test_what_columns_add_to_a_set_is_their_evidence_under_what_the_set_leaves_o
     factor = torch.linalg.cholesky(kernel)
     white = [torch.linalg.solve_triangular(factor, g.flatten(0, 1), upper=False) for g in (y[..., None], *groups)]
     products = [own_products(g[:, None], white[0]) for g in white[1:]]
-    fits = fit_single_groups([NO_COLUMNS, *products], white[0].square().sum(), float(y.numel()), 0.0)
+    fits = fit_single_groups([NO_COLUMNS, *products], white[0].square().sum(), Prior(float(y.numel()), 0.0))[0]
     wanted = (fits.log_evidence[1:] - fits.log_evidence[0]).tolist()
     assert gain_beside(dictionary, found[0], groups) == pytest.approx(wanted, rel=1e-6)
     assert wanted[1] > 5 > max(wanted[0], wanted[2])

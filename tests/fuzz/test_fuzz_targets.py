@@ -147,6 +147,7 @@ def promised(compensator: Compensator, form: Form, joints: Array, covariates: Ar
     with torch.no_grad():
         found = compensator.solve(*given)
         clean, strange = compensator.domain.clean(compensator._inputs(*given))
+        clean = clean[..., : len(form.joints)]
         sd = compensator.sd(*given)
     lost = (strange > 0).numpy()
     return {

@@ -179,21 +179,35 @@ def test_a_bad_json_file_is_named(tmp_path: Path, text: str, words: str) -> None
 
 def test_the_card_schema_wants_hashes_and_what_a_user_must_know() -> None:
     validator = Draft202012Validator(frozen("card"))
+    number = {"low": 0.0, "high": 1.0}
     card = {
+        "format": "1",
         "files": {"model.onnx": "0" * 64},
+        "sha256": {},
         "mechanism": {"name": "tripod"},
         "joints": [{"name": "q1", "unit": "m"}],
         "covariates": [],
-        "domain": {"inputs": {"q1": {"low": 0.0, "high": 1.0}}},
-        "limits": {"q1": {"unit": "m", "limit": 1e-4}},
+        "pose": [],
+        "network": {"kind": "constant"},
+        "domain": {
+            "inputs": {"q1": number},
+            "principal": {"centre": [], "half_range": [], "directions": [], "low": [], "high": []},
+        },
+        "limits": {
+            "q1": {"limit": 1e-4, "most_deviation": 1e-4, "safe_correction": 0.0, "safe_sd": 1e-5, "sd_scale": 1.0}
+        },
+        "lipschitz": 0.1,
+        "iterations": 4,
         "data_sha256": "0" * 64,
         "metrics": {},
         "seed": 0,
         "versions": {"torch": "2.13.0"},
-        "format": "more keys may follow",
+        "date": "2026-01-01",
+        "notes": [],
+        "more": "keys may follow",
     }
     assert validator.is_valid(card)
-    for key in set(card) - {"format"}:
+    for key in set(card) - {"more"}:
         assert not validator.is_valid({k: v for k, v in card.items() if k != key})
     assert not validator.is_valid(card | {"files": {"model.onnx": "abc"}})
 
