@@ -15,7 +15,7 @@ from sklearn.linear_model import BayesianRidge
 from benchmarks.measure import Row, compare
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.effects import Situation, default_gravity
-from ccnn_torch.evidence.marginal_likelihood import fit_single_groups, own_products
+from ccnn_torch.evidence.marginal_likelihood import Prior, fit_single_groups, own_products
 from ccnn_torch.simulation.job import simulate_records
 
 NOISE = 1e-5
@@ -50,7 +50,7 @@ def against_ridge(machine: str, rows: int) -> list[Row]:
 
     def ours() -> torch.Tensor:
         products = [own_products(c, y) for c in own]
-        return fit_single_groups(products, y.square().sum(), float(y.numel()), 0.0).log_evidence
+        return fit_single_groups(products, y.square().sum(), Prior(float(y.numel()), 0.0))[0].log_evidence
 
     def ridge() -> list[float]:
         plain = [BayesianRidge(fit_intercept=False, compute_score=True) for _ in own]

@@ -347,7 +347,8 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "latency": Latency,
     "instrument": Instrument,
 }
-"""Name -> maker. The order is that of listings."""
+"""Name -> maker. The order is that of listings, and of what a verdict names where several do the very same: causes in
+the machine first, the measuring device last."""
 
 EXACT = frozenset({"geometry", "joint_offset", "joint_gain", "frame", "tool", "instrument"})
 """Effects whose form is kinematics: what they leave is something else, where friction, growth or a belt that couples

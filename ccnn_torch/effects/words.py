@@ -30,7 +30,8 @@ _WORDS = {
         "geometry error",
         "The values were fitted together, and single ones do not correct the machine: all are in corrected.yaml (of an "
         "arm also corrected.urdf), or else in diagnosis.json.",
-        "Mounting and lengths of {where}, where a value is off by more than its tolerance.",
+        "Mounting and lengths of {where}, of sliding axes their squareness, where a value is off by more than its "
+        "tolerance.",
     ),
     "joint_offset": Words(
         "an offset of the joints",

@@ -96,12 +96,12 @@ def judge(
     unknown = sum(e.probability for e in explanations if e.drivers)
     outside = unknown > OUTSIDE
     chosen = next(e for e in explanations if bool(e.drivers) == outside)
-    likely, classes = chosen.names, {} if outside else _classes(every, chosen.names)
+    likely, classes = chosen.names, {} if outside else classes_of(every, chosen.names)
     like = classes if of_classes else {}
     sure = frozenset(n for n in likely if marginal(explanations, n, *like.get(n, ())) >= NAMED)
     fewer = next((e for e in explanations if e.names == sure and bool(e.drivers) == outside), chosen)
     if (sure or outside) and (not of_classes or fewer.probability * ODDS > chosen.probability):
-        chosen, classes = fewer, {} if outside else _classes(every, fewer.names)
+        chosen, classes = fewer, {} if outside else classes_of(every, fewer.names)
     drivers = chosen.drivers
     if outside:
         most = BESIDE_UNKNOWN if chosen.names else 1.0
@@ -136,7 +136,7 @@ def is_same(members: frozenset[Any], names: frozenset[Any], classes: Mapping[Any
     return all(any(n in classes.get(e, ()) for e in left) for n in members - names)
 
 
-def _classes(every: Sequence[Explanation[S]], chosen: frozenset[Any]) -> dict[Any, tuple[Any, ...]]:
+def classes_of(every: Sequence[Explanation[S]], chosen: frozenset[Any]) -> dict[Any, tuple[Any, ...]]:
     """For each name those that can stand in its place, the others staying, the most probable first."""
     inside = {e.names: e.probability for e in every if not e.drivers}
     own = inside.get(chosen, 0.0)

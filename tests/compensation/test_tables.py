@@ -150,13 +150,18 @@ def test_tables_of_single_axes_hold_both_directions_of_approach() -> None:
     np.testing.assert_allclose(screw[:, 1] - screw[:, 2], 0.04, atol=2e-3)
     np.testing.assert_allclose([float(row[2]) for row in table], screw[:, 1] - screw[:, 2], atol=1e-5)
     np.testing.assert_allclose([float(row[3]) for row in table], -screw[:, 1], atol=1e-5)
-    assert "leaves in either direction 0.02" in tables["README.md"]
+    assert "leaves in either direction 0.02" in tables["README.md"] and "(not those of" not in tables["README.md"]
+    assert "`direction1 = 0`" in tables["README.md"]
 
 
 def test_directions_that_are_known_only_together_are_not_told_apart() -> None:
     tables = print_tables(with_backlash(together=True), None)
     screw = [line.split() for line in tables["linuxcnc_q2.comp"].splitlines()]
-    assert all(up == down for _, up, down in screw) and "either direction" not in tables["README.md"]
+    assert all(up == down for _, up, down in screw)
+    assert (
+        "not those of `q1`, `q2`, `q3`" in tables["README.md"]
+        and "leaves in either direction 0.02" in tables["README.md"]
+    )
 
 
 def test_identified_links_go_back_into_a_simulator(tmp_path: Path, cli: Cli) -> None:

@@ -22,12 +22,17 @@ from ccnn_torch.report.json_files import plain
 NOISE = 1e-5
 
 
-def _gantry() -> SerialArm:
+def _gantry(*unknown_frames: str) -> SerialArm:
     """Slides along x, y and z; their travels are nowhere stated."""
     turn = math.pi / 2
     links = [[0.0, -turn, 0.0, 0.0], [0.0, turn, 0.0, turn], [0.0, 0.0, 0.0, 0.0]]
     return SerialArm(
-        name="gantry", convention="standard", links=links, joint_types=["prismatic"] * 3, orientation="none"
+        name="gantry",
+        convention="standard",
+        links=links,
+        joint_types=["prismatic"] * 3,
+        orientation="none",
+        unknown_frames=unknown_frames,
     )
 
 
@@ -55,6 +60,20 @@ def test_a_gain_says_from_where_it_counts(tmp_path: Path) -> None:
     table = numbers_table(found, 6)
     assert table is not None and f"joint 3, about q3 = {1e3 * about['value']:.3f} mm" in {r[0] for r in table.rows}
     assert "joint 3: 0.2" in first_screen(found, About())[0].text
+
+
+def test_axes_out_of_square_are_told_before_a_device_that_does_the_same(tmp_path: Path) -> None:
+    commands = np.random.default_rng(0).uniform([0.0, 0.0, -0.4], [1.2, 0.8, 0.0], (80, 3))
+    # Row by row: what each joint's motion adds along the axes.
+    matrix = 1e-6 * np.array([[120.0, -400.0, 250.0], [0.0, -80.0, -300.0], [0.0, 0.0, 60.0]])
+    found = plain(_found(_gantry("base"), tmp_path, commands @ matrix.T, commands).to_json())
+    effects = {e["name"]: e for e in found["effects"]}
+    assert {*found["verdict"]["effects"]} == {"geometry", "joint_gain"} and found["verdict"]["probability"] > 0.95
+    assert all("instrument" in effects[name]["indistinguishable_from"] for name in ("geometry", "joint_gain"))
+    angles, leads = (effects[name]["parameters"] for name in ("geometry", "joint_gain"))
+    np.testing.assert_allclose([leads[f"q{k}"]["value"] for k in (1, 2, 3)], matrix.diagonal(), rtol=0, atol=2e-5)
+    told = [abs(angles[name]["value"]) for name in ("alpha1", "theta2", "alpha2")]
+    np.testing.assert_allclose(told, np.abs(matrix[[0, 0, 1], [1, 2, 2]]), rtol=0, atol=3e-5)
 
 
 def test_a_period_has_the_digits_that_its_waves_need(tmp_path: Path) -> None:

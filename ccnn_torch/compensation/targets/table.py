@@ -52,13 +52,14 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
     truth = _deviation(compensator, checked, middle)
     tables = {"table.csv": _csv(compensator, grid.reshape(-1, n), values.reshape(-1, n))}
     told = [_said("table.csv", "all joints, linear between the points", truth, _between(lines, values, checked))]
-    rows, lost, files = [], [], identifiers([joint.name for joint in joints])
+    rows, lost, joined, files = [], [], [], identifiers([joint.name for joint in joints])
     for j, joint in enumerate(joints):
         name, scale = _NAMES.get(joint.unit, (plain(joint.unit), 1.0))
         line = np.linspace(low[j], high[j], _ALONG)
-        ways, seen = _approached(compensator, j, drawn)
+        ways, seen, apart = _approached(compensator, j, drawn)
         both = np.stack([_deviation(compensator, seen, way)[:, j] for way in ways])
         own = np.array([both[:, near].mean(1) for near in _bins(seen[:, j], line)]).T
+        own = own if apart else np.broadcast_to(own.mean(0), own.shape)
         left = both - np.stack([np.interp(seen[:, j], line, one) for one in own])
         share = _rms(left) / max(_rms(both), 1e-300)
         rows.append(
@@ -66,6 +67,7 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
             f"{np.abs(left).max() * scale:.3g} {name} | {'yes' if share <= _SUFFICES else 'no: c99, st or table.csv'} |"
         )
         if ways[0] is not ways[1]:
+            joined += [] if apart else [f"`{plain(joint.name)}`"]
             lost.append(f"{_rms(both[0] - both[1]) / 2 * scale:.3g} {name} of `{plain(joint.name)}`")
         if share <= _SUFFICES:
             tables[f"linuxcnc_{files[j]}.comp"] = _screw(line * scale, *own * scale)
@@ -76,13 +78,14 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
         tables["klipper_mesh.cfg"], sentence = _mesh(compensator, mechanism)
         told.append(sentence)
     if lost:
+        but = f" (not those of {', '.join(joined)}: the model knows its direction only with others')" if joined else ""
         told.append(
-            "Directions of approach: tables of single axes hold both. Every other file stands between them, and leaves "
-            f"in either direction {', '.join(lost)} (RMS)."
+            f"Directions of approach: tables of single axes hold both{but}. Every other file stands between them, and "
+            f"leaves in either direction {', '.join(lost)} (RMS)."
         )
     told += [text for form, text in _FORMS.items() if any(name.startswith(form) for name in tables)]
     stand = zip(compensator.covariates, middle.tolist(), strict=True)
-    at = ", ".join(f"`{plain(c.name)} = {v:.6g} {plain(c.unit)}`" for c, v in stand)
+    at = ", ".join(f"`{f'{plain(c.name)} = {v:.6g} {plain(c.unit)}'.removesuffix(' 1')}`" for c, v in stand)
     return tables | {"README.md": README.format(told="\n\n".join(told), at=f" Covariates stand at {at}." if at else "")}
 
 
@@ -123,19 +126,21 @@ def _inside(compensator: Compensator, joints: Array, covariates: Tensor) -> Arra
     return joints[inside] if inside.sum() > _FEWEST else joints
 
 
-def _approached(compensator: Compensator, j: int, joints: Array) -> tuple[list[Tensor], Array]:
+def _approached(compensator: Compensator, j: int, joints: Array) -> tuple[list[Tensor], Array, bool]:
     """Covariates with joint j coming from below and from above, the others in the middle, and the joints in the domain.
 
-    Both are the middle where the model does not know of directions, or knows that joint's only together with others'.
+    All joints come from there, and the last is False, where the model knows that joint's direction only together with
+    others'. Both are the middle where it does not know it.
     """
-    middle = compensator.domain.centre[len(compensator.joints) :]
-    way = torch.tensor([float(c.name == f"direction{j + 1}") for c in compensator.covariates], dtype=torch.float64)
-    if way.any():
-        ways = [torch.where(way > 0, sign, middle) for sign in (1.0, -1.0)]
+    middle, names = compensator.domain.centre[len(compensator.joints) :], [c.name for c in compensator.covariates]
+    own, every = f"direction{j + 1}", {f"direction{k + 1}" for k in range(len(compensator.joints))}
+    for moved in ({own}, every) if own in names else ():
+        way = torch.tensor([name in moved for name in names])
+        ways = [torch.where(way, sign, middle) for sign in (1.0, -1.0)]
         inside = _within(compensator, joints, ways[0]) & _within(compensator, joints, ways[1])
         if inside.sum() > _FEWEST:
-            return ways, joints[inside]
-    return [middle, middle], _inside(compensator, joints, middle)
+            return ways, joints[inside], moved == {own}
+    return [middle, middle], _inside(compensator, joints, middle), False
 
 
 def _between(lines: list[Array], values: Array, points: Array) -> Array:

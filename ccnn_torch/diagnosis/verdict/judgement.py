@@ -10,11 +10,11 @@ import torch
 
 from ccnn_torch.diagnosis.discrepancy.smooth import ANY, joint_moves
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.effects import pose_residual
+from ccnn_torch.effects import EFFECTS, pose_residual
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, gain_beside
 from ccnn_torch.evidence.form_error import Posterior, is_unexplained, with_form_error
-from ccnn_torch.evidence.judge import Explanation, judge, marginal, posterior
-from ccnn_torch.evidence.sets import scored
+from ccnn_torch.evidence.judge import ODDS, Explanation, Verdict, classes_of, judge, marginal, posterior
+from ccnn_torch.evidence.sets import scored, subsets_with_one_less
 
 # Log odds against the most probable set beyond which sets are not considered.
 _FAR = 12.0
@@ -26,6 +26,8 @@ _MAIN, _MENDED = 0.5, 15.0
 # Plausible sizes that no cause has on a machine of usual quality: sealed machines whose gap was 30 times the noise had
 # up to 185; a unit mistaken makes 1000.
 _IMPLAUSIBLE = 250.0
+# What a set does in a direction, against what it does in its strongest one, below which that is of second order.
+_SECOND_ORDER = 1e-4
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ def judge_rows(analysis: Analysis) -> Judgement:
         return max([explanation.best, *same], key=lambda f: f.log_posterior)
 
     verdict = judge(leading, every, lambda e: not is_unexplained(analysis.dictionary, fitted(e), analysis.floor))
+    verdict = _in_order_of_library(analysis, verdict, leading, every)
     names, found, drivers = verdict.chosen.names, fitted(verdict.chosen), verdict.drivers
     if verdict.outside:
         drivers = drivers or next((d for f in usual.found if (d := _named(analysis, f)[1])), ())
@@ -97,6 +100,52 @@ def judge_rows(analysis: Analysis) -> Judgement:
         marginal={a.name: marginal(leading, a.name) for a in analysis.atoms if not a.is_discrepancy},
         leading=leading,
     )
+
+
+def _in_order_of_library(
+    analysis: Analysis,
+    verdict: Verdict[FittedSet],
+    explanations: Sequence[Explanation[FittedSet]],
+    every: Sequence[Explanation[FittedSet]],
+) -> Verdict[FittedSet]:
+    """The verdict by other names that do the very same on these rows, where the library lists those first.
+
+    On axes that slide, scale and shear of a device are lead and squareness of the axes. Nothing changes where a name of
+    the verdict adds nothing to what the others can do: only its size speaks for it then.
+    """
+    flat, order = analysis.dictionary.columns.flatten(0, 1), [*EFFECTS]
+    chosen, inside = verdict.chosen, [e for e in explanations if not e.drivers]
+
+    def rank(*members: int) -> int:
+        if not members:
+            return 0
+        sizes = torch.linalg.svdvals(torch.cat([flat[:, analysis.dictionary.groups[i]] for i in members], -1))
+        return int((sizes > _SECOND_ORDER * sizes[0]).sum())
+
+    def is_least(e: Explanation[FittedSet]) -> bool:
+        members = e.best.members
+        return all(rank(*fewer) < rank(*members) for fewer in subsets_with_one_less(members))
+
+    def is_same(e: Explanation[FittedSet]) -> bool:
+        members = e.best.members
+        return rank(*members) == rank(*chosen.best.members) == rank(*{*members, *chosen.best.members})
+
+    def place(names: frozenset[str]) -> int:
+        return max((order.index(n) if n in order else len(order) for n in names), default=-1)
+
+    def is_before(e: Explanation[FittedSet]) -> bool:
+        return -1 < place(e.names - chosen.names) < place(chosen.names - e.names)
+
+    if verdict.outside or not any(map(is_before, inside)) or not is_least(chosen):
+        return verdict
+    # Where the data ask for implausible sizes, these tell apart what the columns do not.
+    least = max(e.best.log_evidence for e in inside) - math.log(ODDS)
+    same = [e for e in inside if e.best.log_evidence > least and is_same(e)]
+    told = min((e for e in same if is_before(e) and is_least(e)), key=lambda e: place(e.names), default=None)
+    if told is None:
+        return verdict
+    probability = max(verdict.probability, min(sum(e.probability for e in same), 1.0))
+    return replace(verdict, chosen=told, classes=classes_of(every, told.names), probability=probability)
 
 
 def without_names(analysis: Analysis, judgement: Judgement) -> Judgement:
