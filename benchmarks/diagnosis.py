@@ -45,7 +45,7 @@ def rows_of(machine: str, causes: tuple[str, ...], rows: int) -> tuple[Situation
 def against_ridge(machine: str, rows: int) -> list[Row]:
     """The evidence of all candidates with columns of their own."""
     analysis = diagnose_rows(*rows_of(machine, ("compliance",), rows)).analysis
-    x, y = analysis.dictionary.columns, analysis.y
+    x, y = analysis.dictionary.columns, analysis.dictionary.y
     own = [x[..., g].contiguous() for g in analysis.dictionary.groups.values()]
 
     def ours() -> torch.Tensor:
