@@ -63,8 +63,37 @@ def only_usable(values: Tensor, usable: Tensor) -> Tensor:
 
 
 def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
-    """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back."""
-    unknown = getattr(situation.mechanism, "unknown_frames", ())
-    index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]
-    columns = situation.parameter_jacobian[..., index] if index else situation.jacobian[..., :0]
+    """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back.
+
+    A frame that a group of rows has for itself acts in these alone.
+    """
+    columns = situation.parameter_jacobian[..., _of_frames(situation)] @ in_groups(situation)
     return only_usable(columns, usable)
+
+
+def in_groups(situation: Situation) -> Tensor:
+    """Which of the columns of fitted frames, `r`, is each of their `f` parameters in every row, `s x f x r` of 0, 1.
+
+    Rows of one group have the same frame among their parameters.
+    """
+    index, values = _of_frames(situation), situation.parameters
+    if values is None or values.dim() == 1:
+        values = situation.mechanism.nominal.expand(len(situation.joints), -1)
+    blocks: list[Tensor] = []
+    for name in dict.fromkeys(_frame_of(situation, k) for k in index):
+        own = [k for k in index if _frame_of(situation, k) == name]
+        number = torch.unique(values[:, own], dim=0, return_inverse=True)[1]
+        group = torch.nn.functional.one_hot(number).to(values.dtype)
+        eye = torch.eye(len(index), dtype=values.dtype)[:, [index.index(k) for k in own]]
+        blocks.append((eye[:, None, :] * group[:, None, :, None]).flatten(-2))
+    return torch.cat([values.new_zeros(len(values), len(index), 0), *blocks], -1)
+
+
+def _of_frames(situation: Situation) -> list[int]:
+    """Numbers of the parameters of frames that are fitted."""
+    unknown = getattr(situation.mechanism, "unknown_frames", ())
+    return [k for k in range(len(situation.mechanism.geometry)) if _frame_of(situation, k) in unknown]
+
+
+def _frame_of(situation: Situation, number: int) -> str:
+    return situation.mechanism.geometry[number].name.partition("_")[0]
