@@ -67,8 +67,10 @@ def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
 
     A frame that a group of rows has for itself acts in these alone.
     """
-    columns = situation.parameter_jacobian[..., _of_frames(situation)] @ in_groups(situation)
-    return only_usable(columns, usable)
+    index = [k for frame in _fitted_frames(situation) for k in frame]
+    if not index:
+        return situation.jacobian[..., :0]
+    return only_usable(situation.parameter_jacobian[..., index] @ in_groups(situation), usable)
 
 
 def in_groups(situation: Situation) -> Tensor:
@@ -76,24 +78,17 @@ def in_groups(situation: Situation) -> Tensor:
 
     Rows of one group have the same frame among their parameters.
     """
-    index, values = _of_frames(situation), situation.parameters
-    if values is None or values.dim() == 1:
-        values = situation.mechanism.nominal.expand(len(situation.joints), -1)
-    blocks: list[Tensor] = []
-    for name in dict.fromkeys(_frame_of(situation, k) for k in index):
-        own = [k for k in index if _frame_of(situation, k) == name]
-        number = torch.unique(values[:, own], dim=0, return_inverse=True)[1]
-        group = torch.nn.functional.one_hot(number).to(values.dtype)
-        eye = torch.eye(len(index), dtype=values.dtype)[:, [index.index(k) for k in own]]
-        blocks.append((eye[:, None, :] * group[:, None, :, None]).flatten(-2))
-    return torch.cat([values.new_zeros(len(values), len(index), 0), *blocks], -1)
+    values = situation.mechanism.resolve(situation.parameters).expand(len(situation.joints), -1)
+    columns, count = [], 0
+    for frame in _fitted_frames(situation):
+        number = torch.unique(values[:, frame], dim=0, return_inverse=True)[1]
+        columns.append(count + number[:, None] * len(frame) + torch.arange(len(frame)))
+        count += (int(number.max()) + 1) * len(frame)
+    return torch.nn.functional.one_hot(torch.cat(columns, -1), count).to(values.dtype)
 
 
-def _of_frames(situation: Situation) -> list[int]:
-    """Numbers of the parameters of frames that are fitted."""
+def _fitted_frames(situation: Situation) -> list[list[int]]:
+    """Numbers of the parameters of each frame that is fitted."""
+    names = [g.name.partition("_")[0] for g in situation.mechanism.geometry]
     unknown = getattr(situation.mechanism, "unknown_frames", ())
-    return [k for k in range(len(situation.mechanism.geometry)) if _frame_of(situation, k) in unknown]
-
-
-def _frame_of(situation: Situation, number: int) -> str:
-    return situation.mechanism.geometry[number].name.partition("_")[0]
+    return [[k for k, name in enumerate(names) if name == frame] for frame in unknown]
