@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import scaled_signature
-from ccnn_torch.diagnosis.residual.rows import frame_columns
+from ccnn_torch.diagnosis.residual.rows import frame_columns, in_groups
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Situation
@@ -128,7 +128,7 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
         # Nothing tells what an arm may touch but where it has been; through its poses its joints would turn many times.
         low, high = here.joints.amin(0), here.joints.amax(0)
         joints = low + (high - low) * torch.rand(_CANDIDATES, len(low), generator=generator, dtype=low.dtype)
-    elif _common(here):
+    elif here.parameters is not None:
         pose = mechanism.sample_workspace(_CANDIDATES, generator)
         joints = mechanism.solve_inverse(pose, here.parameters)
     else:
@@ -140,12 +140,9 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
         order = torch.argsort(covariates["time"])
         covariates = {n: v[order] for n, v in covariates.items()}
         covariates["time"] = covariates["time"] + _APART * torch.arange(len(joints))
-    parameters = here.parameters if _common(here) else None
+    # Of frames by group those of the first row: the next rows are measured in that group.
+    parameters = here.parameters if here.parameters is None or here.parameters.dim() == 1 else here.parameters[0]
     return Situation(mechanism, joints, covariates, here.gravity, parameters, pose)
-
-
-def _common(situation: Situation) -> bool:
-    return situation.parameters is not None and situation.parameters.dim() == 1
 
 
 def _columns(analysis: Analysis, found: FittedSet, there: Situation) -> Tensor:
@@ -159,7 +156,7 @@ def _columns(analysis: Analysis, found: FittedSet, there: Situation) -> Tensor:
         keep = white.keep()
         before = white(_signatures(analysis, found, analysis.situation))[keep].flatten(0, 1)
         taken = torch.linalg.pinv(white(analysis.fitted)[keep].flatten(0, 1)) @ before
-        columns = columns - frames @ taken
+        columns = columns - frames @ (in_groups(analysis.situation)[0] @ taken)
     noise = white.sigma * analysis.floor**0.5
     whitened: Tensor = columns[:, white.channels] / noise[:, None]
     return whitened

@@ -10,7 +10,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.effects.columns import TWIST, caused_by, own_parameters, parameter_columns, shown_columns, twist_columns
 from ccnn_torch.effects.protocol import Coefficient, Effect
-from ccnn_torch.effects.situation import Situation
+from ccnn_torch.effects.situation import Situation, where_moved
 from ccnn_torch.mechanisms import Mechanism, Partial, SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
@@ -90,8 +90,7 @@ _COEFFICIENTS = (
 class Instrument(Effect):
     """Δposition = S (position - middle of the workspace) + z, S symmetric: no rigid motion but by what is secondary.
 
-    The position is what the device shows, where that is known: what it shows as constant it has not scaled, whatever
-    the machine did.
+    What the device shows as constant it has not scaled, whatever the machine did.
 
     The diagonal of S are errors of scale, beside it is half the angle by which two axes are not square. Secondary:
     lean, the other half, a turn, since the device aligns one of the two axes with the machine and not their bisector;
@@ -117,8 +116,7 @@ def _instrument_columns(situation: Situation) -> Tensor:
     mechanism = situation.mechanism
     position, rotation = situation.platform
     if situation.guess is not None:
-        shown = mechanism.frame(situation.guess)[0]
-        position = torch.where(torch.isfinite(shown).all(-1, keepdim=True), shown, position)
+        position = where_moved(position, mechanism.frame(situation.guess)[0])
     from_middle = position - mechanism.frame(mechanism.home_pose)[0]
     shear = [torch.zeros_like(from_middle) for _ in _PAIRS]
     for column, (i, j) in zip(shear, _PAIRS, strict=True):

@@ -19,6 +19,8 @@ WEIGHTS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 """Weights that a machine may have [N], for weights that act on the joints together with a load that was recorded."""
 _STANDARD = 9.80665
 _SAMPLES = 128
+# Share of the nominal spread below which coordinates that were shown are those of the rows.
+_FAR_LESS = 0.5
 # Smallest force or torque of 1 N on a joint [N], [N·m], where gravity does not.
 _LEAST = 0.1
 
@@ -69,6 +71,11 @@ class Situation:
     def pose(self) -> Tensor:
         """Nominal pose at the commanded joints, `... x s x p` [SI]."""
         return self.machine.forward_kinematics(self.joints, self.parameters, self.guess).detach()
+
+    @cached_property
+    def place(self) -> Tensor:
+        """Where in the workspace the rows are, `... x s x p` [SI]: `where_moved` of the nominal pose and the guess."""
+        return self.pose if self.guess is None else where_moved(self.pose, self.guess)
 
     @cached_property
     def jacobian(self) -> Tensor:
@@ -270,6 +277,17 @@ class Situation:
         columns = [self.covariates.get(f"direction{i + 1}") for i in range(self.joints.shape[-1])]
         zero = torch.zeros_like(self.joints[..., 0])
         return torch.stack([zero if d is None else d.expand_as(zero) for d in columns], -1)
+
+
+def where_moved(nominal: Tensor, shown: Tensor) -> Tensor:
+    """Nominal coordinates, but those that were shown where these vary far less over the rows, `... x s x c`.
+
+    A machine that is led to the same few points is there: its nominal coordinates then vary by nothing but the gap, and
+    any cause that goes by them would explain it.
+    """
+    shown = torch.where(torch.isfinite(shown), shown, nominal)
+    spread, other = (values.amax(-2, keepdim=True) - values.amin(-2, keepdim=True) for values in (nominal, shown))
+    return torch.where(other < _FAR_LESS * spread, shown, nominal)
 
 
 def _known(values: Tensor) -> Tensor:

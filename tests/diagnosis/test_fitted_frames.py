@@ -14,10 +14,11 @@ from torch import Tensor
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.diagnosis.from_records import situation_of
 from ccnn_torch.diagnosis.page.outputs import write_corrected
+from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
-from ccnn_torch.effects import Acting, make_effect, reached
+from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, pose_residual, reached
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
+from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames, load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import load_records
 
@@ -69,6 +70,52 @@ def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_th
         corrected = load_mechanism(str(tmp_path / name))
         far = corrected.pose_error(pose, corrected.forward_kinematics(situation.joints)).position
         assert float(far.square().mean().sqrt()) < 1.1 * NOISE * 3**0.5, name
+
+
+def _in_sockets() -> tuple[Situation, Tensor]:
+    """Rows of an arm with errors of its geometry whose tool is in one of two sockets of a plate, set up three times."""
+    keys = load_mechanism(str(DATA / "ur10.yaml")).recipe["keys"]
+    more = {"orientation": "none", "unknown_frames": ["base", "tool"], "frame_per": ["placement"]}
+    arm = SerialArm(**{**keys, **more})
+    g = torch.Generator().manual_seed(5)
+    placement, socket = torch.arange(90) % 3, torch.arange(90) // 3 % 2
+    pose = torch.zeros(90, 3, dtype=torch.float64)
+    pose[:, 0] = 0.05 * socket
+    places = torch.tensor([[0.6, 0.0, 0.2], [0.5, 0.4, 0.3], [0.1, -0.7, 0.25]], dtype=torch.float64)
+    turns = rotation_vector_to_matrix(torch.randn(3, 3, generator=g, dtype=torch.float64))
+    target = places[placement] + (turns[placement] @ pose[..., None])[..., 0]
+    truth = arm.nominal.clone()
+    truth[:6], truth[-6:-3] = 0.0, torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
+    truth[6:-6] += 1e-3 * torch.randn(len(truth) - 12, generator=g, dtype=torch.float64)
+    middle = torch.tensor([0.0, -1.2, 1.5, -1.0, 1.0, 0.0], dtype=torch.float64)
+    joints = middle + 0.7 * torch.randn(90, 6, generator=g, dtype=torch.float64)
+    for _ in range(60):
+        there = arm.forward_kinematics(joints, truth)
+        step = torch.linalg.pinv(arm.jacobian_at(there, joints, truth)) @ (target - there)[..., None]
+        joints = joints + step[..., 0].clamp(-0.2, 0.2)
+    assert float((arm.forward_kinematics(joints, truth) - target).abs().max()) < 1e-9
+    joints = joints + 1e-4 * torch.randn(90, 6, generator=g, dtype=torch.float64)
+    frames = fit_frames(arm, joints, pose, columns={"placement": placement.double().numpy()})
+    return Situation(arm, joints, {}, default_gravity(arm), frames, pose), pose
+
+
+def test_an_error_of_the_geometry_is_named_where_the_device_shows_two_points_alone() -> None:
+    """The nominal place varies there by the gap alone: no scale of the device, and no rest, may go by it."""
+    situation, pose = _in_sockets()
+    found = diagnose_rows(situation, pose)
+    assert found.verdict["effects"] == ["geometry"] and not found.verdict["outside_library"]
+    assert found.gap["after"] < 0.1 * found.gap["before"]
+
+
+def test_a_frame_of_a_group_of_rows_acts_in_these_alone() -> None:
+    """Geometry and frames of the groups leave the noise; with one frame for all they do not."""
+    situation, pose = _in_sockets()
+    frames = frame_columns(situation, torch.ones(90, dtype=torch.bool))
+    assert frames.shape == (90, 3, 3 * 6 + 6)
+    columns = torch.cat([frames, situation.parameter_jacobian[..., 6:-6]], -1).flatten(0, 1)
+    y = pose_residual(situation, pose).flatten()
+    left = y - columns @ torch.linalg.lstsq(columns, y, driver="gelsd").solution
+    assert float(left.square().mean().sqrt()) < 1e-4 < 0.1 * float(y.square().mean().sqrt())
 
 
 def _reversed_second(joints: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
     elsewhere, too, so where that is a candidate no discrepancy term of all drives at once takes them from it.
     """
     mechanism, rows = situation.mechanism, situation.joints.shape[-2]
-    place = unit_range(situation.pose)
+    place = unit_range(situation.place)
     one = torch.ones_like(place[:, :1])
     few = max(_FEWEST, min(_FEW, rows // _ROWS_A_BUMP))
     around = torch.cat([one, place, _bumps(place, min(_PLACES, max(_FEWEST_PLACES, rows // _ROWS_A_PLACE)))], -1)
@@ -305,7 +305,7 @@ def _driven(situation: Situation, driver: str, features: Tensor) -> Atom:
 def _carried(situation: Situation, axes: Tensor) -> Atom:
     """Shifts along axes, `s x 3 x 3`, by a plane over the workspace, and turns about them."""
     lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
-    place = unit_range(situation.pose[:, lengths])
+    place = unit_range(situation.place[:, lengths])
     features = torch.cat([torch.ones_like(place[:, :1]), place], -1)
     moves = platform_moves(situation)
     shifts = ((moves[..., :3] @ axes)[..., None] * features[:, None, None]).flatten(-2)

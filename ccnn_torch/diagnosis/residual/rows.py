@@ -63,8 +63,32 @@ def only_usable(values: Tensor, usable: Tensor) -> Tensor:
 
 
 def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
-    """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back."""
+    """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back.
+
+    A frame that a group of rows has for itself acts in these alone.
+    """
+    index = [k for frame in _fitted_frames(situation) for k in frame]
+    if not index:
+        return situation.jacobian[..., :0]
+    return only_usable(situation.parameter_jacobian[..., index] @ in_groups(situation), usable)
+
+
+def in_groups(situation: Situation) -> Tensor:
+    """Which of the columns of fitted frames, `r`, is each of their `f` parameters in every row, `s x f x r` of 0, 1.
+
+    Rows of one group have the same frame among their parameters.
+    """
+    values = situation.mechanism.resolve(situation.parameters).expand(len(situation.joints), -1)
+    columns, count = [], 0
+    for frame in _fitted_frames(situation):
+        number = torch.unique(values[:, frame], dim=0, return_inverse=True)[1]
+        columns.append(count + number[:, None] * len(frame) + torch.arange(len(frame)))
+        count += (int(number.max()) + 1) * len(frame)
+    return torch.nn.functional.one_hot(torch.cat(columns, -1), count).to(values.dtype)
+
+
+def _fitted_frames(situation: Situation) -> list[list[int]]:
+    """Numbers of the parameters of each frame that is fitted."""
+    names = [g.name.partition("_")[0] for g in situation.mechanism.geometry]
     unknown = getattr(situation.mechanism, "unknown_frames", ())
-    index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]
-    columns = situation.parameter_jacobian[..., index] if index else situation.jacobian[..., :0]
-    return only_usable(columns, usable)
+    return [[k for k, name in enumerate(names) if name == frame] for frame in unknown]
