@@ -119,7 +119,8 @@ def identify(
         progress = None if watch is None else watch("lm")
         return Identification(config, *identify_by_constraint(config, progress, given), given=given)
     mechanism, measured = prepare(config, given)
-    if isinstance(measured.mechanism, Partial) and config.methods == ["lm"] and not config.bootstrap:
+    plain = config.residual == "auto" and config.methods == ["lm"] and not config.bootstrap
+    if isinstance(measured.mechanism, Partial) and plain and not isinstance(config.noise, dict):
         # Parts of poses leave much open: links stay near nominal by priors, as beside any constraint.
         held = config.model_copy(update={"constraint": ConstraintConfig(kind="pose")})
         progress = None if watch is None else watch("lm")
