@@ -350,7 +350,9 @@ def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
 
         def poses(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
             sizes = None if noise is None else sizes_of_pose(noise, seen.pose, "noise")
-            return forward_problem(seen, rows.joints, rows.said, rows.weights, choice, sizes, start=start)
+            # Held-out rows are in units of the noise, too.
+            problem = forward_problem(seen, rows.joints, rows.said, None, choice, sizes, start=start)
+            return replace(problem, weights=rows.weights[None])
 
         return poses
     if seconds is not None:

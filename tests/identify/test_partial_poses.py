@@ -50,7 +50,8 @@ def test_heights_of_a_bed_alone_make_it_flat_where_no_probe_was(tmp_path: Path) 
     write_table(tmp_path / "bed.csv", columns | {"z[m]": noise.numpy()})
     keys = {"records": str(tmp_path / "bed.csv"), "mechanism": "delta_linear", "mechanism_keys": KEYS}
     found = identify(**keys, noise="5 um", seed=0)
-    values = found.mechanism().nominal
+    values, held_out = found.mechanism().nominal, found.results["test"]["position"]
+    assert 0.7 * NOISE < held_out["after"] < 1.5 * NOISE < 3e-5 < held_out["before"]
     elsewhere = nominal.solve_inverse(_bed(200, 7), truth)
     before, after = (nominal.forward_kinematics(elsewhere, v)[:, 2] for v in (nominal.nominal, values))
     assert float(before.std()) > 3e-5
