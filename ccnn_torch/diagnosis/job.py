@@ -39,7 +39,7 @@ class Job(NamedTuple, Generic[_Found]):
 
     Attributes:
         steps: to the verdict, with about the seconds that each takes.
-        diagnose: from the config to the verdict; it is told the function that shows progress.
+        diagnose: from the config to the verdict; its second argument reports the progress.
         complete: what takes longer than the verdict: writes the report, and returns the files beside `diagnosis.json`.
     """
 

@@ -13,14 +13,11 @@ from ccnn_torch.coordinates import Condition, Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.mechanisms.newton import carry_derivative, least_norm
+from ccnn_torch.mechanisms.newton import carry_derivative, nearest
 from ccnn_torch.mechanisms.pose import Frame, frame_gap
 from ccnn_torch.numerics.batching import expand_leading
-from ccnn_torch.numerics.least_squares import levenberg_marquardt
 
 _ROTATION_WEIGHT = 0.04
-# Damping of a search whose solutions are more than one [1].
-_DAMPING = 1e-8
 
 
 class Partial(Mechanism):
@@ -114,21 +111,14 @@ class Partial(Mechanism):
         """See `Mechanism.nearest_joints`; of joints that reach the same the nearest to the guess. No gradient."""
         values = self.resolve(parameters)
         anchor = expand_leading(self.home_joints if guess is None else guess, pose, values).detach()
-        ridge = damping * torch.eye(len(self.joints), dtype=torch.float64)
 
-        def residual(q: Tensor, start: Tensor, v: Tensor, x: Tensor) -> Tensor:
-            gap = frame_gap(self.frame(self.forward_kinematics(q, v)), self.frame(x), rotation_weight)
-            return torch.cat([gap, damping * (q - start)], -1) if damping else gap
+        def gap(q: Tensor, v: Tensor, x: Tensor) -> Tensor:
+            return frame_gap(self.frame(self.forward_kinematics(q, v)), self.frame(x), rotation_weight)
 
-        def slope(q: Tensor, start: Tensor, v: Tensor, x: Tensor) -> Tensor:
-            rows = self._slope(q, v, rotation_weight)
-            return torch.cat([rows, ridge.expand(*q.shape[:-1], -1, -1)], -2) if damping else rows
+        def slope(q: Tensor, v: Tensor) -> Tensor:
+            return self._slope(q, v, rotation_weight)
 
-        data = tuple(d.detach() for d in (anchor, values, pose))
-        found = levenberg_marquardt(residual, anchor, slope, data, tolerance=1e-10, damping=_DAMPING)
-        if damping == 0 and len(self.joints) > len(self.pose):
-            return least_norm(residual, slope, found, anchor, data)
-        return found.value
+        return nearest(gap, slope, anchor, (values, pose), damping, len(self.joints) > len(self.pose))
 
     def singular_values(
         self,

@@ -12,10 +12,9 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.mechanisms.newton import carry_derivative, least_norm
+from ccnn_torch.mechanisms.newton import carry_derivative, nearest
 from ccnn_torch.mechanisms.pose import frame_gap
 from ccnn_torch.numerics.batching import expand_leading, stack_last
-from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.rotations import (
     euler_zyx_to_matrix,
     matrix_to_euler_zyx,
@@ -425,22 +424,13 @@ class SerialArm(Mechanism):
         parts = (position,) if rotation is None else (position, rotation.flatten(-2))
         anchor = expand_leading(self.home_joints if guess is None else guess, position, values).detach()
         weights = self._weights(rotation_weight)
-        ridge = damping * torch.eye(len(self.joints), dtype=torch.float64)
 
-        def residual(q: Tensor, start: Tensor, v: Tensor, x: Tensor, *turn: Tensor) -> Tensor:
+        def gap(q: Tensor, v: Tensor, x: Tensor, *turn: Tensor) -> Tensor:
             here = x, turn[0].reshape(*x.shape, 3) if turn else None
-            gap = frame_gap(self.forward_frame(q, v), here, rotation_weight)
-            return torch.cat([gap, damping * (q - start)], dim=-1) if damping else gap
+            return frame_gap(self.forward_frame(q, v), here, rotation_weight)
 
-        def slope(q: Tensor, start: Tensor, v: Tensor, *rest: Tensor) -> Tensor:
-            rows = self.jacobian(q, v) * weights
-            return torch.cat([rows, ridge.expand(*q.shape[:-1], -1, -1)], dim=-2) if damping else rows
-
-        data = tuple(d.detach() for d in (anchor, values, *parts))
-        found = levenberg_marquardt(residual, anchor, slope, data, tolerance=1e-10, damping=1e-8)
-        if damping == 0 and len(self.joints) > len(weights):
-            return least_norm(residual, slope, found, anchor, data)
-        return found.value
+        redundant = len(self.joints) > len(weights)
+        return nearest(gap, lambda q, v: self.jacobian(q, v) * weights, anchor, (values, *parts), damping, redundant)
 
     def _weights(self, rotation_weight: float) -> Tensor:
         """Weights of the rows of the Jacobian, `6 x 1` or `3 x 1`."""
