@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
-from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
-from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.config.split import Given, held_out_notes
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import (
     Fit,
@@ -34,162 +31,17 @@ from ccnn_torch.identification import (
     tool_points,
     what_is_known,
 )
-from ccnn_torch.identification.config import BesideConfig, ConstraintConfig, IdentifyConfig
-from ccnn_torch.identification.measured import Kinematics, Measured, Rows, nominal_machine, split_records
+from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig
+from ccnn_torch.identification.constrained_rows import ConstraintRows, Kind, poses_of, read_constraint, rows_of
+from ccnn_torch.identification.measured import Kinematics, Measured, Rows, nominal_machine
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.poses import forward_problem
 from ccnn_torch.identification.problems.problem import joined
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
-from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm, as_measured
-from ccnn_torch.records import Records, Table, load_records, stack_columns
-from ccnn_torch.records.headers import check_joints
+from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
 from ccnn_torch.records.joint_map import read_joint_map, with_joints
 from ccnn_torch.records.load import read_source
-
-GROUPED_BY = {"sockets": "placement", "distances": "anchor", "plane": "plane"}
-"""Column that numbers the groups of each kind, unless the config names others."""
-Kind = ConstraintConfig | BesideConfig
-# What the columns of the second place of a distance end with.
-_SECOND = "_b"
-# Joints beyond this are taken for degrees [rad], as in records of poses: 4 turns.
-_ANGLE_LIMIT = 8 * np.pi
-
-
-@dataclass(frozen=True)
-class ConstraintRows:
-    """The rows that take part.
-
-    Attributes:
-        joints: `s x n` [SI].
-        said: the constraint's value of each row, `s x o` [m]: the socket's place on the plate (o = 3), the distance,
-            or the reading (o = 1).
-        group: number of each row's placement, anchor or plane, `s`.
-        labels: the meaning of each number: the grouping columns and their values.
-        weights: `s` [1]; 1 = row to identify from, 0 = held-out row.
-        data_hash: SHA-256 of the records.
-        others: joints of the second place of each row, `s x n` [SI], where distances are between two places.
-        seen: the mechanism as poses `s x p` in `said` show it; None where a constraint holds the tool.
-    """
-
-    joints: Tensor
-    said: Tensor
-    group: Tensor
-    labels: dict[float, dict[str, float]]
-    weights: Tensor
-    data_hash: str
-    others: Tensor | None = None
-    seen: Mechanism | None = None
-
-    @property
-    def in_sockets(self) -> bool:
-        """Whether what is said of a row is its socket's place."""
-        return self.seen is None and self.said.shape[-1] == 3
-
-    @property
-    def cell(self) -> Tensor:
-        """Number of the place that each row's tool is held in, `s`: one socket of one placement, or the group."""
-        keys = torch.cat([self.group[:, None], self.said], dim=-1) if self.in_sockets else self.group[:, None]
-        number: Tensor = torch.unique(keys, dim=0, return_inverse=True)[1]
-        return number
-
-
-def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> ConstraintRows:
-    """Read, select and split the records of a config with a constraint."""
-    about = config.constraint
-    assert about is not None and config.records is not None
-    source = with_test_file(config.records if given is None else given, config.split)
-    if about.kind == "pose":
-        rows, records = _poses_of(config, source, mechanism)
-        weights = torch.zeros(len(records), dtype=torch.float64)
-        weights[split_records(config, records).train] = 1.0
-        return replace(rows, weights=weights)
-    if isinstance(source, Records):
-        raise InputError("records: a constraint has columns of its own; give the path of its file, or a DataFrame")
-    counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
-    table = with_joints(read_source(source, config.columns), counted)
-    there = _taking_part(table, about.where)
-    rows = _rows_of(table, mechanism, about, there)
-    joints = rows.joints
-    columns = {name: table.raw(name)[there.numpy()] for name in table.names}
-    held = rows_of_test_file(config.split, table.parts)
-    nowhere = torch.empty(len(joints), 0, dtype=torch.float64)
-    train = split_by(config.split, nowhere, columns, config.seed, 0.0, None if held is None else held[there]).train
-    weights = torch.zeros(len(joints), dtype=torch.float64)
-    weights[train] = 1.0
-    rows = replace(rows, weights=weights)
-    _check_cells(rows, about)
-    return rows
-
-
-def _rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> ConstraintRows:
-    """The rows of a table that are numbered, all of weight 1."""
-    check_joints(table, mechanism.joints)
-    joints = torch.from_numpy(stack_columns(table, mechanism.joints, _ANGLE_LIMIT))[there]
-    second = [Coordinate(f"{j.name}{_SECOND}", j.unit) for j in mechanism.joints]
-    paired = about.kind == "distances" and any(c.name in table for c in second)
-    others = torch.from_numpy(stack_columns(table, second, _ANGLE_LIMIT))[there] if paired else None
-    if paired:
-        group, labels = torch.zeros(len(joints), dtype=torch.float64), {0.0: {"pairs": 0.0}}
-    else:
-        group, labels = _groups(table, about, there)
-    said = torch.from_numpy(stack_columns(table, _said_columns(table, about)))[there]
-    said = said if said.shape[-1] else torch.zeros(len(joints), 1, dtype=torch.float64)
-    weights = torch.ones(len(joints), dtype=torch.float64)
-    return ConstraintRows(joints, said, group, labels, weights, table.data_hash, others)
-
-
-def _taking_part(table: Table, where: Mapping[str, float]) -> Tensor:
-    """Numbers of the rows that have the values wanted, ascending."""
-    chosen = np.ones(len(table), dtype=bool)
-    for name, value in where.items():
-        if name not in table:
-            raise InputError(f"constraint.where: {table.path} has no column '{name}'; it has {', '.join(table.names)}")
-        chosen &= table.raw(name) == value
-    if not chosen.any():
-        wanted = ", ".join(f"{name} = {value:g}" for name, value in where.items())
-        raise InputError(f"constraint.where: no row of {table.path} has {wanted}; write values that it contains")
-    return torch.from_numpy(np.flatnonzero(chosen))
-
-
-def _groups(table: Table, about: Kind, there: Tensor) -> tuple[Tensor, dict[float, dict[str, float]]]:
-    names = about.by or [GROUPED_BY[about.kind]]
-    for name in names:
-        if name not in table:
-            raise InputError(
-                f"constraint.by: {table.path} has no column '{name}', which numbers the {GROUPED_BY[about.kind]} of "
-                f"each row; add it, or name one of {', '.join(table.names)}"
-            )
-    values: NDArray[np.float64] = np.stack([table.column(name) for name in names], axis=-1)[there.numpy()]
-    if len(names) == 1:
-        return torch.from_numpy(values[:, 0].copy()), {v: {names[0]: v} for v in np.unique(values).tolist()}
-    each, number = np.unique(values, axis=0, return_inverse=True)
-    labels = {float(i): dict(zip(names, row, strict=True)) for i, row in enumerate(each.tolist())}
-    return torch.from_numpy(number.reshape(-1).astype(np.float64)), labels
-
-
-def _said_columns(table: Table, about: Kind) -> list[Coordinate]:
-    if about.kind == "sockets":
-        return [Coordinate(axis, "m") for axis in "xyz"]
-    if about.kind == "distances":
-        return [Coordinate("distance", "m")]
-    return [Coordinate("reading", "m")] if "reading" in table else []
-
-
-def _check_cells(rows: ConstraintRows, about: ConstraintConfig) -> None:
-    """Every place that a held-out row was held in must be known from other rows."""
-    cell = rows.cell
-    used = torch.zeros(int(cell.max()) + 1, dtype=torch.float64).index_add(0, cell, rows.weights)
-    lost = torch.nonzero(used[cell] == 0)
-    if len(lost):
-        label = rows.labels[float(rows.group[lost[0, 0]])]
-        named = ", ".join(f"{name} {value:g}" for name, value in label.items())
-        socket = "a socket of " if rows.in_sockets else ""
-        raise InputError(
-            f"split: {socket}{named} has held-out rows but none to identify from, so these cannot be judged; write "
-            "split.kind=random or a smaller split.test, or measure it more often"
-        )
-
 
 # Links and noise are estimated in turn, the noise from this size on [m].
 _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
@@ -375,25 +227,14 @@ def _beside(config: IdentifyConfig, mechanism: Mechanism) -> tuple[list[Build], 
     found, counts = [], []
     for about in config.constraint.beside:
         if about.kind == "pose":
-            rows = _poses_of(config, about.records, mechanism)[0]
+            rows = poses_of(config, about.records, mechanism)[0]
         else:
             counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
             table = with_joints(read_source(about.records, config.columns), counted)
-            rows = _rows_of(table, mechanism, about, torch.arange(len(table)))
+            rows = rows_of(table, mechanism, about, torch.arange(len(table)))
         found.append(_builder(about, mechanism, rows))
         counts.append(len(rows.joints))
     return found, counts
-
-
-def _poses_of(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[ConstraintRows, Records]:
-    """Rows of poses, or of parts of them, in the machine's own base; all of weight 1."""
-    records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
-    seen = as_measured(mechanism, records.pose_coordinates, records.path)
-    group, weights = torch.zeros(len(records), dtype=torch.float64), torch.ones(len(records), dtype=torch.float64)
-    rows = ConstraintRows(
-        records.joints, records.pose, group, {0.0: {"pose": 0.0}}, weights, records.data_hash, seen=seen
-    )
-    return rows, records
 
 
 def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> dict[str, float]:
