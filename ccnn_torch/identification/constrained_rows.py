@@ -103,6 +103,11 @@ def rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> C
     second = [Coordinate(f"{j.name}{_SECOND}", j.unit) for j in mechanism.joints]
     paired = about.kind == "distances" and any(c.name in table for c in second)
     others = torch.from_numpy(stack_columns(table, second, _ANGLE_LIMIT))[there] if paired else None
+    if paired and about.by is not None:
+        raise InputError(
+            f"constraint.by: {table.path} has distances between two places, {second[0].name} …, which no anchor "
+            "numbers; remove the key"
+        )
     if paired:
         group, labels = torch.zeros(len(joints), dtype=torch.float64), {0.0: {"pairs": 0.0}}
     else:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
 from ccnn_torch.api import identify
+from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.poses import compares_poses
 from ccnn_torch.mechanisms import Mechanism, Partial, load_mechanism
 from ccnn_torch.records import write_table
@@ -95,6 +97,8 @@ def test_heights_and_distances_in_one_fit_make_the_bed_flat_and_parts_of_the_rig
     beside = [{"kind": "pose", "records": str(tmp_path / "bed.csv"), "noise": "10 um"}]
     constraint = {"kind": "distances", "tolerance": {"m": "1 mm", "rad": "5 mrad"}, "beside": beside}
     found = identify(**keys, noise="20 um", split={"test": 0.2}, constraint=constraint)
+    with pytest.raises(InputError, match="has distances between two places, q1_b …, which no anchor"):
+        identify(**keys, constraint={"kind": "distances", "by": ["q1"]})
     block = found.results["constraint"]["beside"][0]
     assert (block["kind"], block["rows"]) == ("pose", 40) and block["after"] < 1.5e-5 < 1e-4 < block["before"]
     elsewhere = _bed(60, 9)
