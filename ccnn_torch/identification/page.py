@@ -49,6 +49,13 @@ def constraint_table(results: Mapping[str, Any]) -> Table | None:
         f"{number_text(about['noise'] / scale, 3)} {unit}, {source}. "
         "Turns count from where the nominal machine sees them."
     )
+    for one in about["beside"]:
+        scale, unit = display_unit("m", one["after"])
+        before, after = (number_text(one[when] / scale, 3) for when in ("before", "after"))
+        note += (
+            f" In the same fit: {count_text(one['rows'], 'row')} of {Path(one['records']).name} ({one['kind']}), "
+            f"off by {before} {unit} RMS before and {after} {unit} after; none of them is held out."
+        )
     return Table(f"What held the tool ({about['kind']})", ("unknown", "value", "standard deviation"), tuple(rows), note)
 
 

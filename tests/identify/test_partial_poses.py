@@ -101,6 +101,9 @@ def test_heights_and_distances_in_one_fit_make_the_bed_flat_and_parts_of_the_rig
         identify(**keys, constraint={"kind": "distances", "by": ["q1"]})
     block = found.results["constraint"]["beside"][0]
     assert (block["kind"], block["rows"]) == ("pose", 40) and block["after"] < 1.5e-5 < 1e-4 < block["before"]
+    found.save(tmp_path / "out")
+    told = (tmp_path / "out" / "identified.md").read_text()
+    assert "In the same fit: 40 rows of bed.csv (pose), off by " in told and "none of them is held out" in told
     elsewhere = _bed(60, 9)
 
     def made(machine: Mechanism) -> tuple[float, float]:
