@@ -49,7 +49,8 @@ def constraint_table(results: Mapping[str, Any]) -> Table | None:
         f"{number_text(about['noise'] / scale, 3)} {unit}, {source}. "
         "Turns count from where the nominal machine sees them."
     )
-    for one in about["beside"]:
+    # Files of earlier versions have none.
+    for one in about.get("beside", []):
         scale, unit = display_unit("m", one["after"])
         before, after = (number_text(one[when] / scale, 3) for when in ("before", "after"))
         note += (
