@@ -30,7 +30,7 @@ _WORDS = {
     "h": "Std std Stunde Stunden heure heures ore hora horas",
     "m": "Meter mètre mètres metri metros",
     "mm": "MM Millimeter millimètre millimètres millimetri milímetros milimetros",
-    "um": "Mikrometer micromètre micromètres micrometri micrómetros",
+    "um": "px pixel pixels Pixel Mikrometer micromètre micromètres micrometri micrómetros",
     "in": "Zoll pouce pouces pollici pulgadas",
     "K": "Kelvin",
     "degC": "Celsius ºC",

@@ -20,7 +20,7 @@ from ccnn_torch.calibration.rows.prepare import Prepared, damping_of, over_all_r
 from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner, make_learner
-from ccnn_torch.mechanisms import Mechanism, Partial, PoseError
+from ccnn_torch.mechanisms import Mechanism, PoseError, Seen
 from ccnn_torch.numerics.blocks import memory_budget
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.report.results.run import RunResults
@@ -70,7 +70,8 @@ class Calibration:
     def _framed(prepared: Prepared, repeat: int) -> Mechanism:
         parameters = prepared.repeat_parameters(repeat)
         mechanism = prepared.mechanism
-        mechanism = mechanism.mechanism if isinstance(mechanism, Partial) else mechanism
+        if isinstance(mechanism, Seen):
+            parameters, mechanism = mechanism.inner_values(parameters), mechanism.mechanism
         return mechanism if parameters is None else mechanism.with_nominal(parameters)
 
     def compensator(self, method: str | None = None) -> Compensator:

@@ -12,7 +12,7 @@ from ccnn_torch.calibration.learning.fitting import Fitted
 from ccnn_torch.calibration.rows.prepare import Prepared
 from ccnn_torch.compensation import Compensator
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.mechanisms import PoseError, Seen
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 # The fixed point q = q* - δ(q) gains a factor of the Lipschitz constant of δ each time, about 1e-3 for real machines.
@@ -55,7 +55,7 @@ def pose_before(prepared: Prepared) -> PoseError:
     """
     if prepared.simulation is not None:
         return prepared.simulation.pose_errors(prepared.joints)[0]
-    nominal = prepared.mechanism.forward_kinematics(prepared.joints, prepared.parameters)
+    nominal = prepared.mechanism.forward_kinematics(prepared.joints, prepared.parameters, prepared.pose)
     return prepared.mechanism.pose_error(prepared.pose, nominal)
 
 
@@ -63,7 +63,7 @@ def pose_with_geometry(prepared: Prepared) -> PoseError | None:
     """Pose error that geometric calibration alone leaves, `r x s`; None where no geometry was fitted."""
     if prepared.identified is None:
         return None
-    reached = prepared.mechanism.forward_kinematics(prepared.joints, prepared.identified)
+    reached = prepared.mechanism.forward_kinematics(prepared.joints, prepared.identified, prepared.pose)
     return prepared.mechanism.pose_error(prepared.pose, reached)
 
 
@@ -123,7 +123,8 @@ def _of_records(
         with torch.no_grad():
             solved = found[k].solve(joints, covariates)
             moved = solved.command + found[k].learned(solved.command, covariates)
-        wanted = _vectors(prepared, prepared.mechanism.forward_kinematics(joints, _parameters(prepared, k)))
+        nominal = prepared.mechanism.forward_kinematics(joints, _wanted(prepared, k), prepared.pose[k])
+        wanted = _vectors(prepared, nominal)
         reached.append(_apart(_model(prepared, k, moved), wanted) + rest)
         damped += float((solved.status == 3).double().mean()) / len(prepared.joints)
     explained, after = _error(torch.stack(left)), _error(torch.stack(reached))
@@ -144,6 +145,16 @@ def pose_with_effects(prepared: Prepared) -> PoseError | None:
 def _parameters(prepared: Prepared, repeat: int) -> Tensor | None:
     """Of the nominal machine in one repeat, frames fitted, `1 x k` or `s x k`."""
     return None if prepared.parameters is None else prepared.parameters[repeat]
+
+
+def _wanted(prepared: Prepared, repeat: int) -> Tensor | None:
+    """The same as the model's instrument shows it: a focal length is no error of the machine."""
+    nominal, mechanism = _parameters(prepared, repeat), prepared.mechanism
+    if nominal is None or prepared.physics is None or not isinstance(mechanism, Seen):
+        return nominal
+    inner = len(mechanism.mechanism.geometry)
+    own = prepared.physics.values[repeat, :, inner:]
+    return torch.cat([nominal[..., :inner], own.expand(*nominal.shape[:-1], -1)], -1)
 
 
 def _model(prepared: Prepared, repeat: int, moved: Tensor) -> Tensor:

@@ -65,6 +65,8 @@ def sizes_by_name(
 def sizes_of_pose(given: Size | Mapping[str, Size], coordinates: Sequence[Coordinate], key: str) -> Tensor:
     """Standard deviation of each pose coordinate: of a position, and of an angle over 0.3 m; or by name. `p` [SI].
 
+    Where only angles are measured it is an angle.
+
     Raises:
         InputError: as `sizes_by_name`, or a coordinate has none.
     """
@@ -74,10 +76,11 @@ def sizes_of_pose(given: Size | Mapping[str, Size], coordinates: Sequence[Coordi
         if missing:
             raise InputError(f"{key}: gives no size of {', '.join(missing)}; add {missing[0]}, or write one number")
         return values
-    base = size(given, "m", key)
+    angles = all(c.unit == "rad" for c in coordinates)
+    base = size(given, "rad" if angles else "m", key)
     if base < 0:
         raise InputError(f"{key}: a standard deviation is not negative, got {given}")
-    return torch.tensor([base / ANGLE_ARM if c.unit == "rad" else base for c in coordinates], dtype=torch.float64)
+    return torch.tensor([base / ANGLE_ARM if c.unit == "rad" and not angles else base for c in coordinates], dtype=torch.float64)
 
 
 def sizes_of_joints(given: Size | Mapping[str, Size], coordinates: Sequence[Coordinate], key: str) -> Tensor:

@@ -21,10 +21,11 @@ from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, no
 from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, used_covariates
+from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.effects.found_machine import found_block
 from ccnn_torch.errors import InputError, RowsError
-from ccnn_torch.mechanisms import BlackBox, Framed, Mechanism, SerialArm, as_measured, fit_frames, judge_frames
+from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm, as_measured, fit_unknown, judge_frames
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES
@@ -123,19 +124,17 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
             "load them with the mechanism that was measured"
         )
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path)
-    parameters = None
-    if isinstance(mechanism, SerialArm) and mechanism.unknown_frames:
-        parameters = fit_frames(mechanism, records.joints, records.pose, columns=records.columns)
+    parameters = fit_unknown(mechanism, records.joints, records.pose, columns=records.columns)
+    if isinstance(mechanism, SerialArm) and parameters is not None:
         try:
             judge_frames(mechanism, records.joints, records.pose, parameters, None, records.path, records.name_rows)
         except InputError as reason:
             raise _named(reason, mechanism, records, parameters) from None
-    elif isinstance(mechanism, Framed) and mechanism.unknown_frames:
-        parameters = mechanism.inlying_frames(records.joints, records.pose)
     down = default_gravity(mechanism) if gravity is None else torch.tensor(list(gravity), dtype=torch.float64)
     if down.shape != (3,):
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
-    if isinstance(mechanism, SerialArm) and "base" in mechanism.unknown_frames and parameters is not None:
+    arm = inside(mechanism)
+    if isinstance(arm, SerialArm) and parameters is not None and "base" in arm.unknown_frames:
         # Where the measuring device stands says nothing about gravity; frames by group of rows share the first one's.
         down = rotation_vector_to_matrix(parameters.reshape(-1, parameters.shape[-1])[0, 3:6]) @ down
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}

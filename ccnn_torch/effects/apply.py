@@ -145,9 +145,9 @@ def measured_pose(situation: Situation, frame: Tensor) -> Tensor:
         gap = position - there[0]
         if rotation is not None and there[1] is not None:
             gap = torch.cat([gap, matrix_to_rotation_vector(rotation @ there[1].mT)], -1)
-        slope = mechanism.frame_slope(pose).detach()
+        slope = mechanism.frame_slope(pose).detach()[..., : mechanism.compared]
         step: Tensor = torch.linalg.solve(slope.mT @ slope, slope.mT @ gap.unsqueeze(-1))
-        pose = pose + step.squeeze(-1)
+        pose = pose + torch.nn.functional.pad(step.squeeze(-1), (0, pose.shape[-1] - mechanism.compared))
     return pose
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects.situation import Situation
-from ccnn_torch.mechanisms import Framed, Mechanism, Partial, SerialArm
+from ccnn_torch.mechanisms import Framed, Mechanism, Seen, SerialArm
 from ccnn_torch.numerics.rotations import skew
 
 _SHOWN = 1e-9
@@ -51,9 +51,20 @@ def per_force(unit: str) -> str:
     return f"{unit}/{'N' if unit == 'm' else 'N/m'}"
 
 
+def inside(mechanism: Mechanism) -> Mechanism:
+    """The machine itself, of which perhaps not all is measured."""
+    return mechanism.mechanism if isinstance(mechanism, Seen) else mechanism
+
+
 def own_parameters(mechanism: Mechanism) -> list[int]:
-    """Numbers of the parameters that are the mechanism's own: not those of its base frame and tool frame."""
-    mechanism = mechanism.mechanism if isinstance(mechanism, Partial) else mechanism
+    """Numbers of the parameters that are the mechanism's own: not those of its base frame and tool frame.
+
+    Of what it is seen through those that have a cause of their own, such as a camera's focal length.
+    """
+    if isinstance(mechanism, Seen):
+        first = len(mechanism.mechanism.geometry)
+        more = [k for k, p in enumerate(mechanism.geometry) if k >= first and p.cause is not None]
+        return [*own_parameters(mechanism.mechanism), *more]
     first, last = 0, len(mechanism.geometry)
     if isinstance(mechanism, SerialArm):
         return list(range(6, last - 6))

@@ -8,10 +8,18 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
-from ccnn_torch.effects.columns import TWIST, caused_by, own_parameters, parameter_columns, shown_columns, twist_columns
+from ccnn_torch.effects.columns import (
+    TWIST,
+    caused_by,
+    inside,
+    own_parameters,
+    parameter_columns,
+    shown_columns,
+    twist_columns,
+)
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import Situation, where_moved
-from ccnn_torch.mechanisms import Mechanism, Partial, SerialArm
+from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
 _SCALE = {"m": 1e-3, "rad": 1e-3}
@@ -56,7 +64,7 @@ class Tool(Effect):
         """A platform that turns, and a tool frame that is known; an unknown one is fitted before anything else."""
         if "tool" in getattr(mechanism, "unknown_frames", ()):
             return f"a known tool frame: that of {mechanism.name} is fitted to the records anyhow"
-        whole = mechanism.mechanism if isinstance(mechanism, Partial) else mechanism
+        whole = inside(mechanism)
         if not isinstance(whole, SerialArm) and whole.frame(whole.home_pose)[1] is None:
             return "a platform that turns: on this one a shift of the tool is a shift of the frame"
         return ""
@@ -156,7 +164,8 @@ class Geometry(Effect):
         mechanism = situation.mechanism
         chosen = caused_by(mechanism, self.name)
         # The parameters of an arm's link i come after its joint i.
-        links = len(chosen) // len(mechanism.joints) if isinstance(mechanism, SerialArm) else 0
+        of_links = isinstance(inside(mechanism), SerialArm) and self.name == "geometry"
+        links = len(chosen) // len(mechanism.joints) if of_links else 0
         return tuple(
             Coefficient(
                 mechanism.geometry[k].name,

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.time import REFERENCE
 from ccnn_torch.mechanisms import Mechanism
 
@@ -51,7 +52,7 @@ def draw_covariates(
     hall = uniform(-2.0, 2.0) + drift * shift + swing * torch.sin(2 * math.pi * swings * shift + phase)
     found = {"time": time, "temperature": REFERENCE + hall}
     sizes = {**_LOAD, **(load or {})}
-    for coordinate in mechanism.pose:
+    for coordinate in inside(mechanism).pose:
         draw = torch.randn(rows, generator=generator, dtype=torch.float64)
         found[f"load_{coordinate.name}"] = sizes[coordinate.unit] * draw
     before = torch.where(torch.rand(1, n, generator=generator, dtype=torch.float64) < 0.5, -1.0, 1.0)
@@ -73,6 +74,6 @@ def directions(joints: Tensor, before: Tensor) -> dict[str, Tensor]:
 def covariate_units(mechanism: Mechanism) -> dict[str, str]:
     """SI unit of every column that the library's effects know, or the machine itself takes, by name."""
     units = {c.name: c.unit for c in mechanism.takes} | {"time": "s", "temperature": "K"}
-    units |= {f"load_{c.name}": "N" if c.unit == "m" else "N*m" for c in mechanism.pose}
+    units |= {f"load_{c.name}": "N" if c.unit == "m" else "N*m" for c in inside(mechanism).pose}
     units |= {f"direction{i + 1}": "1" for i in range(len(mechanism.joints))}
     return units | {f"speed{i + 1}": f"{j.unit}/s" for i, j in enumerate(mechanism.joints)}

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.columns import by_joint, own_parameters, per_force
+from ccnn_torch.effects.columns import by_joint, inside, own_parameters, per_force
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
@@ -26,6 +26,7 @@ class Member(NamedTuple):
 
 def members(mechanism: Mechanism) -> list[Member]:
     """The parts that have lengths; a length that belongs to no leg is a part of its own."""
+    mechanism = inside(mechanism)
     own = own_parameters(mechanism)
     found: dict[str, Member] = {}
     for place, k in enumerate(own):
@@ -187,7 +188,7 @@ class Gravity(Effect):
             unit, size = "rad/m" if turning else "m", SCALE[joint.unit] * PLATFORM_WEIGHT
             found.append(Coefficient(joint.name, unit, size, joint=joint.name, positive=True))
             parts = [("stiffening", unit, size)]
-            if isinstance(mechanism, SerialArm):
+            if isinstance(inside(mechanism), SerialArm):
                 parts += [("tool", unit, size), ("inner links", unit, size)]
             elif turning:
                 parts += [(f"crank {wave}", "rad", size * _LEVER) for wave in ("cos", "sin")]
@@ -212,7 +213,7 @@ class Gravity(Effect):
         mechanism, joints = situation.mechanism, situation.joints
         turning = [j.unit == "rad" for j in mechanism.joints]
         lever = torch.tensor([_LEVER if turns else 1.0 for turns in turning], dtype=joints.dtype)
-        arm = isinstance(mechanism, SerialArm)
+        arm = isinstance(inside(mechanism), SerialArm)
         weight = situation.own_weight_torque
         parts = [weight, weight * weight.abs() / lever]
         if arm:
@@ -228,7 +229,7 @@ class Gravity(Effect):
 
 def _centred(situation: Situation) -> bool:
     """Whether the platform's centre of mass has columns: it turns, and is no arm's, whose tool is small."""
-    return not isinstance(situation.mechanism, SerialArm) and situation.platform[1] is not None
+    return not isinstance(inside(situation.mechanism), SerialArm) and situation.platform[1] is not None
 
 
 def _off_centre(situation: Situation) -> Tensor:

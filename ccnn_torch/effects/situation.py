@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ccnn_torch.mechanisms import Mechanism, Partial, SerialArm
+from ccnn_torch.mechanisms import Mechanism, Seen, SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
@@ -62,10 +62,12 @@ class Situation:
     @cached_property
     def whole(self) -> Situation:
         """The same rows of the mechanism with its whole pose, whatever of it is measured: loads act on all of it."""
-        if not isinstance(self.mechanism, Partial):
+        machine = self.mechanism
+        if not isinstance(machine, Seen):
             return self
-        guess = None if self.guess is None else self.mechanism.filled(self.guess)
-        return replace(self, mechanism=self.mechanism.mechanism, guess=guess)
+        guess = None if self.guess is None else machine.whole_guess(self.guess)
+        inner = machine.inner_values(self.parameters)
+        return replace(self, mechanism=machine.mechanism, guess=guess, parameters=inner)
 
     @cached_property
     def pose(self) -> Tensor:
@@ -90,7 +92,7 @@ class Situation:
     @cached_property
     def frame_slope(self) -> Tensor:
         """Derivative of position and rotation vector by the pose coordinates, `... x s x c x p`."""
-        return self.mechanism.frame_slope(_known(self.pose)).detach()
+        return self.mechanism.frame_slope(_known(self.pose)).detach()[..., : self.mechanism.compared]
 
     @cached_property
     def visible(self) -> Tensor:

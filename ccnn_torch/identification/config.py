@@ -44,6 +44,9 @@ class BesideConfig(Section):
     )
     records: Files = Field(description="their file, with the columns of that kind")
     by: Names | None = Field(default=None, min_length=1, description="as constraint.by")
+    instrument: dict[str, Any] | None = Field(
+        default=None, description="what measured rows of kind pose, e.g. {kind: level} or {kind: wire, anchors: 2}"
+    )
     noise: Size | None = Field(
         default=None, description="standard deviation of one of their equations; null = that of the residuals"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.config.split import Given, held_out_notes
+from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import (
     Fit,
@@ -39,7 +40,9 @@ from ccnn_torch.identification.problems.poses import forward_problem
 from ccnn_torch.identification.problems.problem import joined
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
-from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
+from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, PoseError, SerialArm, fit_unknown
+from ccnn_torch.mechanisms.frames.instrument import instrument
+from ccnn_torch.mechanisms.frames.readings import READINGS
 from ccnn_torch.records.joint_map import read_joint_map, with_joints
 from ccnn_torch.records.load import read_source
 
@@ -100,6 +103,7 @@ def fit_constraint(
     rows: ConstraintRows,
     progress: Progress | None = None,
     others: Sequence[Build] = (),
+    units: Sequence[str] = (),
 ) -> ConstraintFit:
     """Fit the rows that have weight.
 
@@ -109,21 +113,27 @@ def fit_constraint(
 
     Args:
         others: of the rows of other kinds, in the order of the config.
+        units: of their equations.
     """
     assert config.constraint is not None
     build = _builder(config.constraint, mechanism, rows)
     names = [p.name for p in mechanism.geometry]
-    held = [n for n in names if n.startswith(("base_", "tool_r"))]
+    # What an instrument shows has unknown frames fitted to the rows already, and these are free.
+    unknown = mechanism.unknown_frames if isinstance(mechanism, Instrument) else ()
+    held = [n for n in names if n.startswith(("base_", "tool_r")) and n.partition("_")[0] not in unknown]
     about = choice_of(config, mechanism)
     free = select_parameters(mechanism.geometry, ParameterChoice(about.free, [*about.fixed, *held], about.tied))
     of_machine = [n for group in free.groups for n in group]
-    tool = [n for n in of_machine if n.startswith("tool_")]
+    tool = [n for n in of_machine if n.startswith("tool_") and "tool" not in unknown]
     choice = ParameterChoice(of_machine, (), about.tied, {**_priors(config, mechanism, of_machine), **about.prior})
     before = _tool_first(mechanism, build, tool, choice)
     solver = solver_of("lm", config)
     given = [(config.noise, "noise")]
     given += [(one.noise, f"constraint.beside.{i}.noise") for i, one in enumerate(config.constraint.beside)]
-    sources = [_source(make, noise, key) for make, (noise, key) in zip((build, *others), given, strict=True)]
+    units = ["rad" if _angles_alone(rows) else "m", *units]
+    sources = [
+        _source(make, noise, unit, key) for make, unit, (noise, key) in zip((build, *others), units, given, strict=True)
+    ]
     rounds = 1 if all(s.known for s in sources) else _ROUNDS
     selection = select_parameters(mechanism.geometry, choice, before.geometry)
     shared = len(selection.parameters)
@@ -153,10 +163,10 @@ def fit_constraint(
     return ConstraintFit(before, after, selection, known, fit, beside)
 
 
-def _source(build: Build, noise: Any, key: str) -> _Source:
-    known = None if noise is None or isinstance(noise, dict) else size(noise, "m", key)
+def _source(build: Build, noise: Any, unit: str, key: str) -> _Source:
+    known = None if noise is None or isinstance(noise, dict) else size(noise, unit, key)
     if known is not None and not known > 0:
-        raise InputError(f"{key}: {known:g} is no standard deviation; write a length above 0, or remove the key")
+        raise InputError(f"{key}: {known:g} is no standard deviation; write a size above 0, or remove the key")
     return _Source(build, known or _FIRST_NOISE, known is not None)
 
 
@@ -182,6 +192,16 @@ def held_distance(mechanism: Mechanism, rows: ConstraintRows, state: State) -> T
     return far
 
 
+def _held_error(mechanism: Mechanism, rows: ConstraintRows, state: State, held: Tensor) -> PoseError:
+    """Of the held-out rows, `1 x t`, as an angle where only angles were measured."""
+    far = held_distance(mechanism, rows, state)[None, held]
+    return PoseError(torch.zeros_like(far), far) if _angles_alone(rows) else PoseError(far, None)
+
+
+def _angles_alone(rows: ConstraintRows) -> bool:
+    return rows.seen is not None and all(c.unit == "rad" for c in rows.seen.pose[: rows.seen.compared])
+
+
 def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
     if about.kind == "sockets":
         several = len(torch.unique(rows.said, dim=0)) > 1
@@ -199,9 +219,13 @@ def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
         return sockets
     seconds, seen = rows.others, rows.seen
     if seen is not None:
+        # What an instrument adds to the machine's parameters comes behind them.
+        own = seen.geometry[len(mechanism.geometry) :]
 
         def poses(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
             sizes = None if noise is None else sizes_of_pose(noise, seen.pose, "noise")
+            start = torch.cat([start, seen.nominal[len(start) :]])
+            choice = replace(choice, free=[*(choice.free or ()), *(p.name for p in own)])
             # Held-out rows are in units of the noise, too.
             problem = forward_problem(seen, rows.joints, rows.said, None, choice, sizes, start=start)
             return replace(problem, weights=rows.weights[None])
@@ -221,20 +245,37 @@ def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
     return build
 
 
-def _beside(config: IdentifyConfig, mechanism: Mechanism) -> tuple[list[Build], list[int]]:
-    """What makes the problem of the rows of each other kind, and how many rows it has."""
+def _beside(config: IdentifyConfig, mechanism: Mechanism) -> tuple[list[Build], list[dict[str, Any]]]:
+    """What makes the problem of the rows of each other kind; how many rows it has, and the unit of an equation."""
     assert config.constraint is not None
-    found, counts = [], []
+    found: list[Build] = []
+    told: list[dict[str, Any]] = []
     for about in config.constraint.beside:
         if about.kind == "pose":
-            rows = poses_of(config, about.records, mechanism)[0]
+            seen = mechanism if about.instrument is None else _held_by(mechanism, about.instrument)
+            rows = _placed(poses_of(config, about.records, seen)[0])
         else:
             counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
             table = with_joints(read_source(about.records, config.columns), counted)
             rows = rows_of(table, mechanism, about, torch.arange(len(table)))
         found.append(_builder(about, mechanism, rows))
-        counts.append(len(rows.joints))
-    return found, counts
+        told.append({"rows": len(rows.joints), "unit": "rad" if _angles_alone(rows) else "m"})
+    return found, told
+
+
+def _held_by(mechanism: Mechanism, about: Mapping[str, Any]) -> Instrument:
+    kind, link = about.get("kind"), about.get("link")
+    if not isinstance(kind, str):
+        raise InputError(f"constraint.beside: instrument: write its kind, one of {', '.join(READINGS)}")
+    return instrument(mechanism, kind, link, {k: v for k, v in about.items() if k not in ("kind", "link")})
+
+
+def _placed(rows: ConstraintRows) -> ConstraintRows:
+    """With what is unknown of an instrument fitted to its rows, links nominal."""
+    if not isinstance(rows.seen, Instrument):
+        return rows
+    fitted = fit_unknown(rows.seen, rows.joints, rows.said, rows.weights)
+    return rows if fitted is None else replace(rows, seen=rows.seen.with_nominal(fitted))
 
 
 def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> dict[str, float]:
@@ -242,7 +283,9 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
     assert about is not None
     given, key = about.tolerance, "constraint.tolerance"
     one = 0.01 if isinstance(given, dict) else size(given, None, key)
-    links = [p for p in mechanism.geometry if p.name in free and not p.name.startswith("tool_")]
+    unknown = mechanism.unknown_frames if isinstance(mechanism, Instrument) else ()
+    there = [p for p in mechanism.geometry if p.name in free and p.name.partition("_")[0] not in ("tool", *unknown)]
+    links = [p for p in there if p.cause is None]
     # The default is for lengths and angles, whichever of them there are.
     others = {"m", "rad"} - {p.unit for p in links}
     named = {name: v for name, v in given.items() if name not in others} if isinstance(given, dict) else {}
@@ -252,7 +295,8 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
             f"{key}: {min(values):g} is no standard deviation; write a size above 0, or fix the parameters"
         )
     priors = {p.name: v for p, v in zip(links, values, strict=True)}
-    return priors | {n: _TOOL_TOLERANCE for n in free if n.startswith("tool_")}
+    priors |= {p.name: plausible_error(p) for p in there if p.cause is not None}
+    return priors | {n: _TOOL_TOLERANCE for n in free if n.startswith("tool_") and "tool" not in unknown}
 
 
 def _tool_first(mechanism: Mechanism, build: Build, tool: list[str], choice: ParameterChoice) -> State:
@@ -294,9 +338,11 @@ def identify_by_constraint(
     """
     mechanism, notes = _machine(config)
     rows = read_constraint(config, mechanism, given)
+    rows = _placed(rows)
+    mechanism = rows.seen if isinstance(rows.seen, Instrument) else mechanism
     begun = time.perf_counter()
-    others, counts = _beside(config, mechanism)
-    fit = fit_constraint(config, mechanism, rows, progress, others)
+    others, told = _beside(config, mechanism)
+    fit = fit_constraint(config, mechanism, rows, progress, others, [one["unit"] for one in told])
     outcome = Outcome(
         machines=torch.arange(1),
         values=fit.after.geometry[None],
@@ -317,11 +363,11 @@ def identify_by_constraint(
         data_hash=rows.data_hash,
         notes=notes,
     )
-    before, after = (PoseError(held_distance(mechanism, rows, s)[None, held], None) for s in (fit.before, fit.after))
+    before, after = (_held_error(mechanism, rows, s, held) for s in (fit.before, fit.after))
     noise = None if config.noise is None else fit.after.noise
     found = Found(outcome, _known(fit), before, after)
     results, arrays = assemble(config, measured, fit.selection, {"lm": found}, noise, _only_by_prior(fit, found.known))
-    results["constraint"] = _constraint(config, rows, fit, counts)
+    results["constraint"] = _constraint(config, rows, fit, told)
     return measured, {"lm": outcome}, results, arrays
 
 
@@ -358,7 +404,9 @@ def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
     return [f"No better known than by the tolerance given: {', '.join(prior)}."] if prior else []
 
 
-def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit, counts: list[int]) -> dict[str, Any]:
+def _constraint(
+    config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit, told: list[dict[str, Any]]
+) -> dict[str, Any]:
     """What was found of the constraint itself."""
     assert config.constraint is not None
     k, knowledge = len(fit.selection.parameters), fit.knowledge
@@ -380,7 +428,7 @@ def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit
         "noise": fit.after.noise,
         "noise_known": config.noise is not None,
         "beside": [
-            {"kind": about.kind, "records": str(about.records), "rows": count, **found}
-            for about, count, found in zip(config.constraint.beside, counts, fit.beside, strict=True)
+            {"kind": about.kind, "records": str(about.records), **one, **found}
+            for about, one, found in zip(config.constraint.beside, told, fit.beside, strict=True)
         ],
     }

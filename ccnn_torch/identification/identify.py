@@ -35,7 +35,7 @@ from ccnn_torch.identification.solve import (
     select,
     solver_of,
 )
-from ccnn_torch.mechanisms import Framed, Mechanism, Partial
+from ccnn_torch.mechanisms import Framed, Mechanism, Seen
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
@@ -120,7 +120,7 @@ def identify(
         return Identification(config, *identify_by_constraint(config, progress, given), given=given)
     mechanism, measured = prepare(config, given)
     plain = config.residual == "auto" and config.methods == ["lm"] and not config.bootstrap
-    if isinstance(measured.mechanism, Partial) and plain and not isinstance(config.noise, dict):
+    if isinstance(measured.mechanism, Seen) and plain and not isinstance(config.noise, dict):
         # Parts of poses leave much open: links stay near nominal by priors, as beside any constraint.
         held = config.model_copy(update={"constraint": ConstraintConfig(kind="pose")})
         progress = None if watch is None else watch("lm")

@@ -12,7 +12,15 @@ from ccnn_torch.config.sizes import sizes_of_joints, sizes_of_pose
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, fit_frames, judge_frames, load_mechanism
+from ccnn_torch.mechanisms import (
+    Framed,
+    Mechanism,
+    SerialArm,
+    as_measured,
+    fit_unknown,
+    judge_frames,
+    load_mechanism,
+)
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Split
 
@@ -207,10 +215,11 @@ def rows_of_split(records: Records, split: Split) -> tuple[Rows, Rows]:
 
 
 def _start(mechanism: Mechanism, rows: Rows) -> Tensor:
-    """Where the search starts, `1 x K`: frames that are unknown have to be fitted first."""
-    if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:
-        return mechanism.nominal[None].clone()
-    return fit_frames(mechanism, rows.joints[0], rows.observed[0])[None]
+    """Where the search starts, `1 x K`: what is unknown of frames and instruments has to be fitted first."""
+    fitted = None
+    if not isinstance(mechanism, Framed):
+        fitted = fit_unknown(mechanism, rows.joints[0], rows.observed[0])
+    return (mechanism.nominal if fitted is None else fitted)[None].clone()
 
 
 def _notes(records: Records) -> list[str]:

@@ -51,7 +51,7 @@ def constraint_table(results: Mapping[str, Any]) -> Table | None:
     )
     # Files of earlier versions have none.
     for one in about.get("beside", []):
-        scale, unit = display_unit("m", one["after"])
+        scale, unit = display_unit(one.get("unit", "m"), one["after"])
         before, after = (number_text(one[when] / scale, 3) for when in ("before", "after"))
         note += (
             f" In the same fit: {count_text(one['rows'], 'row')} of {Path(one['records']).name} ({one['kind']}), "

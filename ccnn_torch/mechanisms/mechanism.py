@@ -349,6 +349,11 @@ class Mechanism(nn.Module):
         return torch.isfinite(self.solve_inverse(pose, parameters)).all(-1)
 
     @property
+    def compared(self) -> int:
+        """How many of the pose coordinates are measured; further ones say what a row's measurement was of."""
+        return len(self.pose)
+
+    @property
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Box of poses that samples are drawn from: low and high, `p` each [SI]."""
         return self.low, self.high

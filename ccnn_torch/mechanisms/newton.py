@@ -67,7 +67,7 @@ def carry_derivative(x: Tensor, slope: Tensor, residual: Tensor) -> Tensor:
 
 def nearest(
     gap: Callable[..., Tensor],
-    slope: Callable[[Tensor, Tensor], Tensor],
+    slope: Callable[..., Tensor],
     anchor: Tensor,
     data: tuple[Tensor, ...],
     damping: float,
@@ -76,8 +76,8 @@ def nearest(
     """Joints of the least gap by damped Newton from `anchor`, `... x n`; no gradient flows through it.
 
     Args:
-        gap: `(joints, *data)` -> `... x c` [m]; the first of the data are the parameters.
-        slope: `(joints, parameters)` -> `... x c x n`, its derivative by the joints.
+        gap: `(joints, *data)` -> `... x c` [m].
+        slope: `(joints, *data)` -> `... x c x n`, its derivative by the joints.
         anchor: `... x n` [SI], without gradient.
         data: what the gap needs besides joints, `... x d` each.
         damping: weight of the distance from the anchor beside the gap [m per joint unit].
@@ -89,8 +89,8 @@ def nearest(
         left = gap(q, *rest)
         return torch.cat([left, damping * (q - start)], dim=-1) if damping else left
 
-    def slopes(q: Tensor, start: Tensor, parameters: Tensor, *rest: Tensor) -> Tensor:
-        rows = slope(q, parameters)
+    def slopes(q: Tensor, start: Tensor, *rest: Tensor) -> Tensor:
+        rows = slope(q, *rest)
         return torch.cat([rows, ridge.expand(*q.shape[:-1], -1, -1)], dim=-2) if damping else rows
 
     plain = (anchor, *(d.detach() for d in data))

@@ -15,7 +15,8 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.dh_file import read_dh_file, read_urdf
 from ccnn_torch.mechanisms.frames.framed import Framed
-from ccnn_torch.mechanisms.frames.partial import Partial
+from ccnn_torch.mechanisms.frames.instrument import Instrument, instrument
+from ccnn_torch.mechanisms.frames.partial import Partial, Seen
 from ccnn_torch.mechanisms.machines.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.machines.five_bar import FiveBar
 from ccnn_torch.mechanisms.machines.overconstrained import Overconstrained2Dof
@@ -209,6 +210,17 @@ def _partial(mechanism: str | Mapping[str, Any], pose: Sequence[str], keys: Mapp
     return Partial(_inside(mechanism, keys), pose)
 
 
+def _instrument(
+    mechanism: str | Mapping[str, Any],
+    kind: str,
+    link: int | None = None,
+    keys: Mapping[str, Any] | None = None,
+    **of_instrument: Any,
+) -> Instrument:
+    """A mechanism by name or file with its keys, or by description, seen through an instrument."""
+    return instrument(_inside(mechanism, keys), kind, link, of_instrument)
+
+
 REGISTRY: dict[str, Callable[..., Mechanism]] = {
     "tripod": Tripod,
     "machine_tool": MachineTool,
@@ -220,6 +232,7 @@ REGISTRY: dict[str, Callable[..., Mechanism]] = {
     "serial": SerialArm,
     "framed": _framed,
     "partial": _partial,
+    "instrument": _instrument,
 }
 
 _READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
@@ -241,7 +254,8 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
             function that makes one.
         allow_code: run the Python file that an identified machine's mechanism file names.
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
-            framed: mechanism, its keys, base, tool; partial: mechanism, its keys, pose; …).
+            framed: mechanism, its keys, base, tool; partial: mechanism, its keys, pose; instrument: mechanism, its
+            keys, kind, link, and those of the kind; …).
 
     Raises:
         InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, a
@@ -265,7 +279,7 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
     else:
         mechanism = _call(spec, maker, keys)
-    if (spec in REGISTRY or is_plugin(spec)) and not isinstance(mechanism, Framed | Partial):
+    if (spec in REGISTRY or is_plugin(spec)) and not isinstance(mechanism, Framed | Seen):
         mechanism.recipe = {"spec": spec, "keys": keys}
     return mechanism
 

@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.compensation import LoadedModel
+from ccnn_torch.effects.columns import inside
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import (
     Mechanism,
     PoseError,
+    Seen,
     SerialArm,
     as_measured,
     load_mechanism,
@@ -58,7 +60,8 @@ def nominal_mechanism(
             return model.machine.nominal
         with code_refused(f"{model.path}: its mechanism", allow_code):
             return mechanism_from_description(about, allow_code=True)
-    given = load_mechanism(spec, **(keys or {}))
+    shown = load_mechanism(spec, **(keys or {}))
+    given = inside(shown)
     if isinstance(given, SerialArm) and len(about["pose"]) == 3:
         given = given.with_orientation("none")
     for key in ("name", "joints", "pose"):
@@ -68,7 +71,7 @@ def nominal_mechanism(
                 f"{', '.join(about['pose'])}), not for {given.name}; take the model of that machine"
             )
     given.set_parameters(about["parameters"])
-    return given
+    return shown.around(given) if isinstance(shown, Seen) else given
 
 
 def mapped_columns(model: LoadedModel, records: Any, machine: Mechanism) -> tuple[dict[str, str], dict[str, str]]:
@@ -95,7 +98,8 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
     ideal = torch.from_numpy(np.asarray(found["ideal"]))
     nominal = machine.forward_kinematics(records.joints, guess=pose)
     if model.machine is not None:
-        real = as_measured(model.machine.identified, machine.pose)
+        real = model.machine.identified
+        real = machine.around(real) if isinstance(machine, Seen) else as_measured(real, machine.pose)
         predicted = real.forward_kinematics(records.joints, guess=pose)
     else:
         predicted = machine.forward_kinematics(ideal, guess=pose)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ccnn_torch.calibration.rows.dataset import Dataset, pad_rows
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, fit_frames, judge_frames
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_unknown, judge_frames
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
 
@@ -32,21 +32,18 @@ def frames_of_repeats(
             f"{one_for}: {mechanism.name} has frames per group of rows (frame_per, tool_per), and one compensator "
             f"needs one frame; take the rows of one group, or write {one_for}=none"
         )
-    unknown = mechanism.unknown_frames if isinstance(mechanism, (SerialArm, Framed)) else ()
-    if not unknown:
-        return None, []
     rows = pad_rows([Dataset.part(split, "fit") for split in splits])
     weights = torch.zeros(len(splits), len(records.joints), dtype=torch.float64)
     weights.scatter_add_(1, rows.index, rows.weights)
+    parameters = fit_unknown(mechanism, records.joints, records.pose, weights, records.columns)
+    if parameters is None:
+        return None, []
+    if not (getattr(mechanism, "frame_per", ()) or getattr(mechanism, "tool_per", ())):
+        parameters = parameters.unsqueeze(-2)
     notes = []
     if isinstance(mechanism, SerialArm):
-        parameters = fit_frames(mechanism, records.joints, records.pose, weights, columns=records.columns)
-        if not (mechanism.frame_per or mechanism.tool_per):
-            parameters = parameters.unsqueeze(-2)
         about = (records.joints, records.pose, parameters, weights, records.path, records.name_rows)
         notes += judge_frames(mechanism, *about)
-    else:
-        assert isinstance(mechanism, Framed)
-        parameters = mechanism.inlying_frames(records.joints, records.pose, weights).unsqueeze(-2)
-    notes.append(f"Frames fitted first, on the training rows of each repeat: {' and '.join(unknown)}.")
+    unknown = " and ".join(getattr(mechanism, "unknown_frames", ()))
+    notes.append(f"Frames fitted first, on the training rows of each repeat: {unknown}.")
     return parameters, notes

@@ -117,7 +117,8 @@ class Physics:
         # not known.
         same = (len(a.effect.coefficients(there.whole)) == len(a.coefficients) for a in self.acting[repeat])
         there = there.whole if all(same) else there
-        return machine_parts(there, self.acting[repeat], self.values[repeat, 0], covariates, margin)
+        values = self.values[repeat, 0, : len(there.mechanism.geometry)]
+        return machine_parts(there, self.acting[repeat], values, covariates, margin)
 
     def block(self) -> dict[str, dict[str, Values]]:
         """For results.json: each coefficient's value in every repeat, by effect and name."""

@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis.residual.distance import USUAL, Size, distance, size_o
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.errors import InputError, RowsError
-from ccnn_torch.mechanisms import BlackBox, Framed, SerialArm
+from ccnn_torch.mechanisms import BlackBox, Framed, Seen, SerialArm
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form, fit_frames
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.headers import EULER_ANGLES
@@ -212,7 +212,7 @@ def frame_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
     if not len(joints):
         return ""
     seen = mechanism.frame(measured)
-    if isinstance(mechanism, Framed) or (isinstance(mechanism, SerialArm) and mechanism.unknown_frames):
+    if isinstance(mechanism, Framed | Seen) or (isinstance(mechanism, SerialArm) and mechanism.unknown_frames):
         return ""
     if isinstance(mechanism, SerialArm):
         there = mechanism.frame(mechanism.forward_kinematics(joints, _closed_form(mechanism, joints, measured)))[0]

@@ -23,7 +23,7 @@ from ccnn_torch.diagnosis.verdict.text import noise_text
 from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames
+from ccnn_torch.mechanisms import SerialArm, fit_unknown
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
@@ -91,10 +91,8 @@ def write_corrected(folder: Path, diagnosis: Diagnosis) -> None:
     change = torch.tensor([found.get(name, 0.0) for name in names], dtype=torch.float64)
     machine = mechanism.with_nominal(mechanism.nominal + change)
     rows = analysis.situation.joints, analysis.measured
-    if isinstance(machine, SerialArm) and machine.unknown_frames:
-        machine = machine.with_nominal(fit_frames(machine, *rows))
-    elif isinstance(machine, Framed) and machine.unknown_frames:
-        machine = machine.with_nominal(machine.inlying_frames(*rows))
+    fitted = fit_unknown(machine, *rows)
+    machine = machine if fitted is None else machine.with_nominal(fitted)
     nominal = dict(zip(names, before.tolist(), strict=True))
     maps = [(diagnosis.machine or {}).get(key) for key in ("columns", "joint_map")]
     write_machine(machine, nominal, folder, Path(CORRECTED[0]).stem, *maps)

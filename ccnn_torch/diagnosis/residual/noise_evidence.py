@@ -46,6 +46,8 @@ def noise_of_repeats(situation: Situation, measured: Tensor) -> Noise | None:
         measured: poses, `s x p` [SI].
     """
     held = [v[:, None] for name, v in situation.covariates.items() if name not in _FREE]
+    # Readings of different corners or anchors are none of one target.
+    held.append(measured[:, situation.mechanism.compared :])
     residual = pose_residual(situation, measured)
     fine = torch.isfinite(residual).all(-1)
     target = number_targets(torch.cat([situation.joints, *held], -1)[fine], FEWEST_TARGETS)

@@ -22,7 +22,7 @@ from ccnn_torch.identification.problems.whitened import (
     gather_rows,
     whitened_problem,
 )
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, Seen
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
@@ -128,7 +128,11 @@ def compares_poses(mechanism: Mechanism) -> bool:
     So of serial arms, of poses in a frame of their own (base_x …), which a leg alone lacks, and of a machine that has
     more joints than pose coordinates and computes its pose from them.
     """
-    if mechanism.orientations or any(p.name.startswith(("base_", "tool_")) for p in mechanism.geometry):
+    if (
+        mechanism.orientations
+        or isinstance(mechanism, Seen)
+        or any(p.name.startswith(("base_", "tool_")) for p in mechanism.geometry)
+    ):
         return True
     computed = type(mechanism).forward_kinematics is not Mechanism.forward_kinematics
     return computed and len(mechanism.joints) > len(mechanism.pose)
@@ -167,7 +171,7 @@ def forward_problem(
     names = [c.name for c in mechanism.pose]
     angles = torch.tensor([c.unit == "rad" for c in mechanism.pose], device=rows.pose.device)
     turning = [names.index(a) for a in _TURN] if set(_TURN) <= set(names) else []
-    rest = [i for i in range(len(names)) if i not in turning]
+    rest = [i for i in range(mechanism.compared) if i not in turning]
     order = [*rest, *turning]
     turns = (rotation_vector_to_matrix(rows.pose[..., turning]).flatten(-2),) if turning else ()
 
@@ -178,8 +182,8 @@ def forward_problem(
         else:
             there = mechanism.forward_kinematics(q, full, x)
             if not turning:
-                gap = there - x
-                return torch.where(angles, gap - (gap.detach() / (2 * math.pi)).round() * (2 * math.pi), gap)
+                gap = (there - x)[..., rest]
+                return torch.where(angles[rest], gap - (gap.detach() / (2 * math.pi)).round() * (2 * math.pi), gap)
             position, rotation = there[..., rest], rotation_vector_to_matrix(there[..., turning])
         gap = position - x[..., rest]
         back = measured[0].reshape(*measured[0].shape[:-1], 3, 3).mT

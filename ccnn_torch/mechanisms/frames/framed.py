@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import Condition, Coordinate, Parameter
+from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.frames.around import Around
 from ccnn_torch.mechanisms.frames.fit import best_closed_form, rigid_body_frame
 from ccnn_torch.mechanisms.machines.serial import FRAME, compose
 from ccnn_torch.mechanisms.mechanism import Mechanism
@@ -22,7 +21,7 @@ from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix, skew
 
 
-class Framed(Mechanism):
+class Framed(Around):
     """base · mechanism · tool: its pose is the measured frame x, y, z [m], rx, ry, rz [rad] (a rotation vector).
 
     A mechanism without orientation has the pose x, y, z. Parameters in order: base_x … base_rz (where the mechanism's
@@ -148,19 +147,6 @@ class Framed(Mechanism):
         values = self.resolve(parameters)
         closest = self._closest(pose, values, self.rotation_weight)
         return self.mechanism.reachable(closest, self._split(values)[1])
-
-    def under(self, conditions: Mapping[str, Tensor]) -> Framed:
-        """The mechanism inside under them."""
-        inner = self.mechanism.under(conditions)
-        if inner is self.mechanism:
-            return self
-        twin = copy.copy(self)
-        twin._modules = {**self._modules, "mechanism": inner}
-        return twin
-
-    def lacking(self, conditions: Sequence[str]) -> list[Condition]:
-        """As of the mechanism inside."""
-        return self.mechanism.lacking(conditions)
 
     def inlying_frames(self, joints: Tensor, pose: Tensor, weights: Tensor | None = None) -> Tensor:
         """As `fitted_frames` to the rows that are no gross outliers; weights: `... x s`, 0 leaves a row out."""

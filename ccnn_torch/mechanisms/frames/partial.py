@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import Condition, Coordinate
+from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.frames.around import Around
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative, nearest
@@ -20,53 +20,50 @@ from ccnn_torch.numerics.batching import expand_leading
 _ROTATION_WEIGHT = 0.04
 
 
-class Partial(Mechanism):
-    """A mechanism seen through an instrument that shows some of its pose coordinates.
+class Seen(Around):
+    """A mechanism as something shows it: its pose is what is read, which may be less than the mechanism's whole pose.
 
-    Joints and parameters are the mechanism's. Its pose has the coordinates that are measured; `frame` takes the others
-    from the home pose, so that no error is seen in them. Where joints are more than coordinates, `nearest_joints`
-    gives the joints nearest to the guess that reach them.
+    Joints are the mechanism's, parameters too, with those of what reads it behind them. Where joints are more than
+    readings, `nearest_joints` gives the joints nearest to the guess that reach them.
 
     Attributes:
         mechanism: a copy of the mechanism, without hooks.
-        seen: numbers of the coordinates that are measured, among those of the mechanism.
     """
 
-    def __init__(self, mechanism: Mechanism, pose: Sequence[str]) -> None:
-        """Take the mechanism, and the names of the coordinates that are measured.
-
-        Raises:
-            InputError: none is named, or one that the mechanism's pose has not.
-        """
+    def __init__(
+        self, mechanism: Mechanism, pose: Sequence[Coordinate], home: Sequence[float], own: Sequence[Parameter] = ()
+    ) -> None:
+        """Take the mechanism, what is read and given, the row at home, and what else is unknown."""
         inner = mechanism.with_nominal(mechanism.nominal)
-        names = [c.name for c in inner.pose]
-        strange = [name for name in pose if name not in names]
-        if strange or not pose:
-            what = f"has no pose coordinate '{strange[0]}'" if strange else "needs a pose coordinate that is measured"
-            raise InputError(f"mechanism '{inner.name}' {what}; it has {', '.join(names)}")
-        seen = [k for k, name in enumerate(names) if name in pose]
         super().__init__(
             name=inner.name,
             joints=inner.joints,
-            pose=[inner.pose[k] for k in seen],
-            geometry=inner.geometry,
-            low=inner.low[seen].tolist(),
-            high=inner.high[seen].tolist(),
-            home_pose=inner.home_pose[seen].tolist(),
+            pose=pose,
+            geometry=[*inner.geometry, *own],
+            low=[v - 1e-6 for v in home],
+            high=[v + 1e-6 for v in home],
+            home_pose=home,
             home_joints=inner.home_joints.tolist(),
         )
-        self.mechanism, self.seen, self.takes = inner, seen, inner.takes
+        self.mechanism, self.takes = inner, inner.takes
 
-    def _own_file(self) -> dict[str, Any]:
-        keys = {"mechanism": self.mechanism.describe(), "pose": [c.name for c in self.pose]}
-        return {"spec": "partial", "keys": keys}
+    def inner_values(self, parameters: Tensor | None) -> Tensor | None:
+        """Of the parameters `... x k` those of the mechanism inside; None where none are given."""
+        return None if parameters is None else parameters[..., : len(self.mechanism.geometry)]
 
     def _follow_nominal(self) -> None:
-        self.mechanism.nominal.copy_(self.nominal)
+        self.mechanism.nominal.copy_(self.nominal[: len(self.mechanism.geometry)])
         self.mechanism._follow_nominal()
         self.home_joints.copy_(self.mechanism.home_joints)
-        for own in ("home_pose", "low", "high"):
-            getattr(self, own).copy_(getattr(self.mechanism, own)[self.seen])
+        self.home_pose.copy_(self.forward_kinematics(self.home_joints))
+
+    def whole_guess(self, pose: Tensor) -> Tensor | None:
+        """A whole pose of the mechanism inside near one that shows this, `... x p'` [SI]; None where nothing says."""
+        return None
+
+    def around(self, mechanism: Mechanism) -> Seen:
+        """Another mechanism seen in the same way."""
+        raise NotImplementedError
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 6` or `x 3`."""
@@ -74,30 +71,18 @@ class Partial(Mechanism):
 
     def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
         """What is seen of samples of the mechanism; `count x p` [SI]."""
-        return self.mechanism.sample_workspace(count, generator)[..., self.seen]
+        return self.forward_kinematics(self.mechanism.sample_joints(count, generator))
 
     def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:
         """Of the mechanism, `count x n` [SI]."""
         return self.mechanism.sample_joints(count, generator)
 
-    def forward_kinematics(
-        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
-    ) -> Tensor:
-        """What is seen of the mechanism's pose of the joints, `... x p` [SI]."""
-        near = None if guess is None else self.filled(guess)
-        return self.mechanism.forward_kinematics(joints, parameters, near)[..., self.seen]
-
-    def frame(self, pose: Tensor) -> Frame:
-        """The mechanism's frame where all that is not seen is as in the home pose; no rotation where no angle is."""
-        position, rotation = self.mechanism.frame(self.filled(pose))
-        return position, rotation if any(c.unit == "rad" for c in self.pose) else None
-
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Joints nearest to the guess whose pose has these coordinates, `... x n` [SI]; differentiable."""
         values = self.resolve(parameters)
         found = self.nearest_joints(pose, values, guess, _ROTATION_WEIGHT)
-        slope = self._slope(found, values, _ROTATION_WEIGHT)
-        gap = frame_gap(self.frame(self.forward_kinematics(found, values)), self.frame(pose), _ROTATION_WEIGHT)
+        slope = self._slope(found, values, pose, _ROTATION_WEIGHT)
+        gap = frame_gap(self.frame(self.forward_kinematics(found, values, pose)), self.frame(pose), _ROTATION_WEIGHT)
         return carry_derivative(found, slope, gap)
 
     def nearest_joints(
@@ -113,12 +98,12 @@ class Partial(Mechanism):
         anchor = expand_leading(self.home_joints if guess is None else guess, pose, values).detach()
 
         def gap(q: Tensor, v: Tensor, x: Tensor) -> Tensor:
-            return frame_gap(self.frame(self.forward_kinematics(q, v)), self.frame(x), rotation_weight)
+            return frame_gap(self.frame(self.forward_kinematics(q, v, x)), self.frame(x), rotation_weight)
 
-        def slope(q: Tensor, v: Tensor) -> Tensor:
-            return self._slope(q, v, rotation_weight)
+        def slope(q: Tensor, v: Tensor, x: Tensor) -> Tensor:
+            return self._slope(q, v, x, rotation_weight)
 
-        return nearest(gap, slope, anchor, (values, pose), damping, len(self.joints) > len(self.pose))
+        return nearest(gap, slope, anchor, (values, pose), damping, len(self.joints) > self.compared)
 
     def singular_values(
         self,
@@ -127,8 +112,8 @@ class Partial(Mechanism):
         parameters: Tensor | None = None,
         guess: Tensor | None = None,
     ) -> Tensor:
-        """See `Mechanism.singular_values`; as many as there are coordinates."""
-        return super().singular_values(joints, rotation_weight, parameters, guess)[..., : len(self.seen)]
+        """See `Mechanism.singular_values`; as many as there are readings."""
+        return super().singular_values(joints, rotation_weight, parameters, guess)[..., : self.compared]
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """All that is finite: what is not seen may be anything; `...`, bool."""
@@ -136,34 +121,78 @@ class Partial(Mechanism):
 
     def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
         """As of the mechanism, in the pose of the joints."""
-        return self.mechanism.skeleton(self.mechanism.forward_kinematics(joints, parameters), joints, parameters)
+        inner = self.inner_values(parameters)
+        return self.mechanism.skeleton(self.mechanism.forward_kinematics(joints, inner), joints, inner)
 
-    def under(self, conditions: Mapping[str, Tensor]) -> Partial:
-        """The mechanism inside under them."""
-        inner = self.mechanism.under(conditions)
-        if inner is self.mechanism:
-            return self
-        twin = copy.copy(self)
-        twin._modules = {**self._modules, "mechanism": inner}
-        return twin
+    def _slope(self, joints: Tensor, values: Tensor, pose: Tensor, rotation_weight: float) -> Tensor:
+        """The Jacobian with its rotation rows weighed, 0 where there is no pose."""
+        rows = torch.nan_to_num(self.jacobian(joints, values, pose))
+        weight = torch.ones(rows.shape[-2], 1, dtype=rows.dtype)
+        weight[3:] = rotation_weight
+        return rows * weight
 
-    def lacking(self, conditions: Sequence[str]) -> list[Condition]:
-        """As of the mechanism inside."""
-        return self.mechanism.lacking(conditions)
 
-    def filled(self, pose: Tensor) -> Tensor:
+class Partial(Seen):
+    """A mechanism of whose pose some coordinates are measured.
+
+    `frame` takes the others from the home pose, so that no error is seen in them.
+
+    Attributes:
+        seen: numbers of the coordinates that are measured, among those of the mechanism.
+    """
+
+    def __init__(self, mechanism: Mechanism, pose: Sequence[str]) -> None:
+        """Take the mechanism, and the names of the coordinates that are measured.
+
+        Raises:
+            InputError: none is named, or one that the mechanism's pose has not.
+        """
+        names = [c.name for c in mechanism.pose]
+        strange = [name for name in pose if name not in names]
+        if strange or not pose:
+            what = f"has no pose coordinate '{strange[0]}'" if strange else "needs a pose coordinate that is measured"
+            raise InputError(f"mechanism '{mechanism.name}' {what}; it has {', '.join(names)}")
+        seen = [k for k, name in enumerate(names) if name in pose]
+        super().__init__(mechanism, [mechanism.pose[k] for k in seen], mechanism.home_pose[seen].tolist())
+        self.seen = seen
+        self.low.copy_(mechanism.low[seen])
+        self.high.copy_(mechanism.high[seen])
+
+    def _own_file(self) -> dict[str, Any]:
+        keys = {"mechanism": self.mechanism.describe(), "pose": [c.name for c in self.pose]}
+        return {"spec": "partial", "keys": keys}
+
+    def _follow_nominal(self) -> None:
+        super()._follow_nominal()
+        for own in ("home_pose", "low", "high"):
+            getattr(self, own).copy_(getattr(self.mechanism, own)[self.seen])
+
+    def around(self, mechanism: Mechanism) -> Seen:
+        """Another mechanism of which the same coordinates are measured."""
+        return Partial(mechanism, [c.name for c in self.pose])
+
+    def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
+        """What is seen of samples of the mechanism; `count x p` [SI]."""
+        return self.mechanism.sample_workspace(count, generator)[..., self.seen]
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """What is seen of the mechanism's pose of the joints, `... x p` [SI]."""
+        near = None if guess is None else self.whole_guess(guess)
+        return self.mechanism.forward_kinematics(joints, parameters, near)[..., self.seen]
+
+    def frame(self, pose: Tensor) -> Frame:
+        """The mechanism's frame where all that is not seen is as in the home pose; no rotation where no angle is."""
+        position, rotation = self.mechanism.frame(self.whole_guess(pose))
+        return position, rotation if any(c.unit == "rad" for c in self.pose) else None
+
+    def whole_guess(self, pose: Tensor) -> Tensor:
         """The mechanism's whole pose, with the home pose in what is not seen: of `... x p` the `... x p'` [SI]."""
         columns = [*self.mechanism.home_pose.expand(*pose.shape[:-1], -1).unbind(-1)]
         for i, k in enumerate(self.seen):
             columns[k] = pose[..., i]
         return torch.stack(columns, -1)
-
-    def _slope(self, joints: Tensor, values: Tensor, rotation_weight: float) -> Tensor:
-        """The Jacobian with its rotation rows weighed, 0 where there is no pose."""
-        rows = torch.nan_to_num(self.jacobian(joints, values))
-        weight = torch.ones(rows.shape[-2], 1, dtype=rows.dtype)
-        weight[3:] = rotation_weight
-        return rows * weight
 
 
 def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "records") -> Mechanism:

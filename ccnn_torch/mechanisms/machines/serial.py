@@ -430,7 +430,9 @@ class SerialArm(Mechanism):
             return frame_gap(self.forward_frame(q, v), here, rotation_weight)
 
         redundant = len(self.joints) > len(weights)
-        return nearest(gap, lambda q, v: self.jacobian(q, v) * weights, anchor, (values, *parts), damping, redundant)
+        return nearest(
+            gap, lambda q, v, *_: self.jacobian(q, v) * weights, anchor, (values, *parts), damping, redundant
+        )
 
     def _weights(self, rotation_weight: float) -> Tensor:
         """Weights of the rows of the Jacobian, `6 x 1` or `3 x 1`."""

@@ -128,6 +128,8 @@ class Beside(Result):
     kind: Literal["pose", "sockets", "distances", "plane"]
     records: str
     rows: int
+    unit: Literal["m", "rad"] = "m"
+    """of noise, before and after"""
     noise: float
     """standard deviation of one equation: given, or that of the residuals"""
     before: float

@@ -1,0 +1,197 @@
+"""A mechanism seen through an instrument: a camera, a wire, a dial gauge, a level or a second encoder on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.frames.fit import fit_frames
+from ccnn_torch.mechanisms.frames.framed import Framed
+from ccnn_torch.mechanisms.frames.partial import Seen
+from ccnn_torch.mechanisms.frames.readings import Place, Reading, make_reading
+from ccnn_torch.mechanisms.machines.serial import SerialArm, compose
+from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.mechanisms.pose import Frame
+from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.numerics.outliers import inlying
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+
+# Rounds in which rows that are gross outliers are left out of the fit of what is unknown.
+_ROUNDS = 3
+
+
+class Instrument(Seen):
+    """A mechanism whose pose is what an instrument reads, and after it what the instrument was pointed at.
+
+    The second part (a corner of a board, the number of an anchor) is given with each row and never compared: forward
+    kinematics take it from `guess`, which is the row as it was recorded, and return it as it is. Parameters are the
+    mechanism's, then the instrument's. What is read counts as a position along x, y, z of `frame` (lengths) or as a
+    rotation vector (angles).
+
+    Attributes:
+        reading: the instrument.
+        link: number of the link that holds it, 0 = the base; None = the tool or platform.
+    """
+
+    def __init__(self, mechanism: Mechanism, reading: Reading, link: int | None = None) -> None:
+        """See the class.
+
+        Raises:
+            InputError: a link that there is not, or an instrument that needs an orientation on a machine without one.
+        """
+        links = len(mechanism.joints)
+        if link is not None and not (isinstance(mechanism, SerialArm) and 0 <= link <= links):
+            what = (
+                f"write 0 to {links}" if isinstance(mechanism, SerialArm) else "only a serial arm has links; remove it"
+            )
+            raise InputError(f"link: {link} is no link of {mechanism.name}; {what}")
+        at_home = place_of(mechanism, link, mechanism.home_joints, mechanism.nominal)
+        if reading.turns and at_home.rotation is None:
+            raise InputError(f"mechanism '{mechanism.name}' has no orientation, which a {reading.kind} on it needs")
+        own = torch.tensor([p.nominal for p in reading.parameters], dtype=torch.float64)
+        usual = torch.tensor(reading.usual, dtype=torch.float64)
+        home = [*reading(at_home, own, usual).tolist(), *reading.usual]
+        super().__init__(mechanism, [*reading.read, *reading.given], home, reading.parameters)
+        self.reading, self.link = reading, link
+
+    @property
+    def compared(self) -> int:
+        """How many coordinates are read; the rest are given."""
+        return len(self.reading.read)
+
+    @property
+    def unknown_frames(self) -> tuple[str, ...]:
+        """What is fitted to rows first, as the names of its parameters begin: base and tool of an arm, an anchor."""
+        unknown: tuple[str, ...] = getattr(self.mechanism, "unknown_frames", ())
+        unknown = unknown if self.link is None else tuple(name for name in unknown if name != "tool")
+        return (*unknown, *self.reading.unknown)
+
+    def _own_file(self) -> dict[str, Any]:
+        keys = {"mechanism": self.mechanism.describe(), "kind": self.reading.kind, **self.reading.keys}
+        return {"spec": "instrument", "keys": keys if self.link is None else {**keys, "link": self.link}}
+
+    def around(self, mechanism: Mechanism) -> Instrument:
+        """The same instrument, with its parameters, on another machine."""
+        found = Instrument(mechanism, self.reading, self.link)
+        return found.with_nominal(torch.cat([mechanism.nominal, self.nominal[len(self.mechanism.geometry) :]]))  # type: ignore[return-value]
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """What is read with these joints, and what is given by `guess` (home without), `... x p` [SI]."""
+        values = self.resolve(parameters)
+        count = len(self.mechanism.geometry)
+        given = (self.home_pose if guess is None else guess)[..., self.compared :]
+        there = place_of(self.mechanism, self.link, joints, values[..., :count])
+        read = self.reading(there, values[..., count:], given)
+        return torch.cat([read, given.expand(*read.shape[:-1], -1)], -1)
+
+    def frame(self, pose: Tensor) -> Frame:
+        """What is read: lengths as a position, angles as a rotation vector."""
+        read = pose[..., : self.compared]
+        read = torch.nn.functional.pad(read, (0, 3 - self.compared))
+        if self.pose[0].unit == "m":
+            return read, None
+        return torch.zeros_like(read), rotation_vector_to_matrix(read)
+
+    def fitted(self, joints: Tensor, pose: Tensor, weights: Tensor | None = None) -> Tensor:
+        """All parameters, those of `unknown_frames` fitted to rows, the rest nominal.
+
+        Args:
+            joints: `s x n` [SI].
+            pose: readings and what they are of, `s x p` [SI].
+            weights: `... x s`, 0 leaves a row out.
+
+        Returns:
+            `... x k` [SI].
+
+        Raises:
+            InputError: too few rows.
+        """
+        weights = torch.ones(len(joints), dtype=torch.float64) if weights is None else weights
+        flat = [self._fitted_to(joints, pose, w) for w in weights.reshape(-1, len(joints))]
+        return torch.stack(flat).reshape(*weights.shape[:-1], -1)
+
+    def _fitted_to(self, joints: Tensor, pose: Tensor, weights: Tensor) -> Tensor:
+        start = self.nominal.clone()
+        count = len(self.mechanism.geometry)
+        unknown = self.unknown_frames
+        free = [k for k, g in enumerate(self.geometry) if g.name.partition("_")[0] in unknown]
+        used = weights > 0
+        if not free:
+            return start
+        if int(used.sum()) * self.compared < len(free):
+            raise InputError(
+                f"{self.name}: {int(used.sum())} rows of {self.compared} readings cannot determine where the "
+                f"{self.reading.kind} is ({len(free)} unknowns); measure more"
+            )
+        q, x = joints[used], pose[used]
+        arm = self.mechanism
+        if isinstance(arm, SerialArm) and arm.unknown_frames:
+            stands, poses = self.reading.frames(q, x, start[count:])
+            if poses is not None:
+                start[:count] = fit_frames(arm, stands, poses)
+        there = place_of(arm, self.link, q, start[:count])
+        start[count:] = self.reading.start(there, x, start[count:])
+        kept = torch.ones(len(q), dtype=torch.float64)
+        for _ in range(_ROUNDS):
+
+            def gap(values: Tensor, kept: Tensor = kept, start: Tensor = start) -> Tensor:
+                full = start.index_copy(0, torch.tensor(free), values)
+                left = self.forward_kinematics(q, full, x) - x
+                return (left[:, : self.compared] * kept[:, None]).flatten()
+
+            found = levenberg_marquardt(gap, start[free], lambda v, gap=gap: jacobian_of(gap, v)[1], max_iterations=100)
+            start = start.index_copy(0, torch.tensor(free), found.value)
+            left = self.forward_kinematics(q, start, x)[:, : self.compared] - x[:, : self.compared]
+            kept = inlying(left.norm(dim=-1).nan_to_num(nan=torch.inf), kept >= 0, self.compared, len(free)).double()
+        return start
+
+
+def place_of(mechanism: Mechanism, link: int | None, joints: Tensor, values: Tensor) -> Place:
+    """Where the link is that holds an instrument, or the tool or platform, in the measuring frame."""
+    if link is not None and isinstance(mechanism, SerialArm):
+        base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3]
+        rotation, position = compose(base, mechanism.link_frames(joints, values)[link])
+        return Place(position, rotation, joints)
+    if isinstance(mechanism, SerialArm):
+        return Place(*mechanism.forward_frame(joints, values), joints)
+    return Place(*mechanism.frame(mechanism.forward_kinematics(joints, values)), joints)
+
+
+def fit_unknown(
+    mechanism: Mechanism,
+    joints: Tensor,
+    pose: Tensor,
+    weights: Tensor | None = None,
+    columns: Mapping[str, NDArray[np.float64]] | None = None,
+) -> Tensor | None:
+    """All parameters with the frames fitted that are unknown, as `fit_frames`; None where all are known."""
+    if not getattr(mechanism, "unknown_frames", ()):
+        return None
+    if isinstance(mechanism, SerialArm):
+        return fit_frames(mechanism, joints, pose, weights, columns=columns)
+    if isinstance(mechanism, Framed):
+        return mechanism.inlying_frames(joints, pose, weights)
+    assert isinstance(mechanism, Instrument)
+    return mechanism.fitted(joints, pose, weights)
+
+
+def instrument(
+    mechanism: Mechanism, kind: str, link: int | None = None, keys: Mapping[str, Any] | None = None
+) -> Instrument:
+    """A mechanism with an instrument of this kind.
+
+    Args:
+        keys: of the instrument, see `READINGS`.
+
+    Raises:
+        InputError: a kind or key that is not known.
+    """
+    return Instrument(mechanism, make_reading(kind, keys or {}, mechanism), link)

@@ -1,0 +1,286 @@
+"""Instruments: what each reads of the place of the link or tool that holds it, and what is unknown of it."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import Coordinate, Parameter
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.frames.board import board_poses
+from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+
+# Plausible errors: of a focal length and an image's centre as a share of it, of distortion, of a place that a tape
+# measured, of a mounting's turn.
+_FOCUS, _DISTORTION, _PLACE, _TURN = 0.01, 0.05, 0.02, 0.05
+PIXEL = 1e-6
+"""A pixel counts as this length on the image [m], as columns in px are read."""
+# Nothing is seen nearer to a camera than this [m].
+_BEHIND = 1e-3
+
+
+class Place(NamedTuple):
+    """Position `... x 3` [m] and rotation `... x 3 x 3` (or None) of what holds the instrument, joints `... x n`."""
+
+    position: Tensor
+    rotation: Tensor | None
+    joints: Tensor
+
+
+class Reading:
+    """An instrument.
+
+    Attributes:
+        kind: its name in `READINGS`.
+        keys: from which it was made.
+        turns: whether it needs the orientation of what holds it.
+        read: what it reads; all lengths or all angles, three at most.
+        given: what it was pointed at, columns of the records.
+        usual: of what is given, where no row says it [SI].
+        parameters: its own.
+        unknown: beginnings of the names of those of them that are fitted before anything else.
+    """
+
+    kind = ""
+    turns = False
+    keys: dict[str, Any]
+    read: tuple[Coordinate, ...]
+    given: tuple[Coordinate, ...] = ()
+    usual: tuple[float, ...] = ()
+    parameters: tuple[Parameter, ...]
+    unknown: tuple[str, ...]
+
+    def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
+        """What it reads, `... x c` [SI]; own `... x m`, given `... x g`."""
+        raise NotImplementedError
+
+    def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
+        """Its parameters near those that suit rows `s x (c + g)`, from the nominal ones, `m` [SI]."""
+        return own
+
+    def frames(self, joints: Tensor, rows: Tensor, own: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Stands of the machine `t x n` and the whole poses that the rows show there, `t x 6`; None where none are."""
+        return joints[:0], None
+
+
+class Camera(Reading):
+    """Pixels u, v of points of a board: pinhole with two terms of radial distortion.
+
+    On the hand it looks at a board that stands; else it stands and looks at a board on the hand. The measuring frame
+    of the machine is the board's (on the hand) or the camera's; the tool frame is the camera's or the board's. A pixel
+    counts as 1 um on the image.
+    """
+
+    kind = "camera"
+    turns = True
+    read = (Coordinate("u", "m"), Coordinate("v", "m"))
+    given = tuple(Coordinate(f"board_{axis}", "m") for axis in "xyz")
+    usual = (0.0, 0.0, 0.0)
+
+    def __init__(
+        self,
+        fx: float,
+        cx: float,
+        cy: float,
+        fy: float | None = None,
+        k1: float = 0.0,
+        k2: float = 0.0,
+        on_hand: bool = True,
+        refine: bool = True,
+    ) -> None:
+        """Focal lengths and centre in pixels, k1, k2 of the normalised radius [1]; fitted to the rows with `refine`."""
+        self.on_hand, self.unknown = on_hand, ("camera",) if refine else ()
+        focus = fx if fy is None else fy
+        self.keys = {"fx": fx, "cx": cx, "cy": cy, "fy": focus, "k1": k1, "k2": k2, "on_hand": on_hand}
+        self.keys["refine"] = refine
+        pixels, share = {"fx": fx, "fy": focus, "cx": cx, "cy": cy}, {"k1": k1, "k2": k2}
+        self.parameters = (
+            *(
+                Parameter(f"camera_{n}", "m", v * PIXEL, scale=_FOCUS * fx * PIXEL, cause="camera")
+                for n, v in pixels.items()
+            ),
+            *(Parameter(f"camera_{n}", "1", v, scale=_DISTORTION, cause="camera") for n, v in share.items()),
+        )
+
+    def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
+        assert place.rotation is not None
+        if self.on_hand:
+            seen = (place.rotation.mT @ (given - place.position)[..., None])[..., 0]
+        else:
+            seen = (place.rotation @ given[..., None])[..., 0] + place.position
+        fx, fy, cx, cy, k1, k2 = own.unbind(-1)
+        deep = seen[..., 2]
+        ratio = seen[..., :2] / torch.where(deep > _BEHIND, deep, torch.nan)[..., None]
+        square = ratio.square().sum(-1)
+        wide = 1 + k1 * square + k2 * square.square()
+        return torch.stack([fx * ratio[..., 0] * wide + cx, fy * ratio[..., 1] * wide + cy], -1)
+
+    def frames(self, joints: Tensor, rows: Tensor, own: Tensor) -> tuple[Tensor, Tensor | None]:
+        """By the board's corners in each image."""
+        fx, fy, cx, cy, k1, k2 = own.unbind(-1)
+        ratio = torch.stack([(rows[:, 0] - cx) / fx, (rows[:, 1] - cy) / fy], -1)
+        plain = ratio
+        for _ in range(20):
+            square = plain.square().sum(-1, keepdim=True)
+            plain = ratio / (1 + k1 * square + k2 * square.square())
+        return board_poses(joints, plain, rows[:, 2:], self.on_hand)
+
+
+class Wire(Reading):
+    """Distance of the tool's point from anchors at unknown places: a draw wire, a telescopic ball bar."""
+
+    kind = "wire"
+    read = (Coordinate("distance", "m"),)
+    given = (Coordinate("anchor", "1"),)
+    usual = (1.0,)
+
+    def __init__(self, anchors: int = 1) -> None:
+        """How many anchors there are; the column `anchor` numbers them from 1."""
+        self.anchors = _count(anchors, "anchors")
+        self.keys = {"anchors": anchors}
+        self.unknown = tuple(f"anchor{i + 1}" for i in range(self.anchors))
+        self.parameters = tuple(
+            Parameter(f"{name}_{axis}", "m", 0.0, scale=_PLACE) for name in self.unknown for axis in "xyz"
+        )
+
+    def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
+        length: Tensor = (place.position - _chosen(own, given[..., 0], 3)).square().sum(-1, keepdim=True)
+        return (length + 1e-24).sqrt()
+
+    def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
+        """|p|² - d² = 2 p·a - |a|² is linear in a and |a|²."""
+        found = own.clone()
+        for i in range(self.anchors):
+            p, d = place.position[rows[:, 1] == i + 1], rows[rows[:, 1] == i + 1, 0]
+            if len(p) < 4:
+                raise InputError(f"anchor {i + 1}: needs at least 4 rows, got {len(p)}; measure it more often")
+            left = torch.cat([2 * p, -torch.ones_like(p[:, :1])], dim=-1)
+            right = (p.square().sum(-1) - d.square())[:, None]
+            found[3 * i : 3 * i + 3] = torch.linalg.lstsq(left, right, driver="gelsd").solution[:3, 0]
+        return found
+
+
+class Dial(Reading):
+    """A dial gauge or a probe: height of the tool's point over planes at unknown places, along their normals."""
+
+    kind = "dial"
+    read = (Coordinate("reading", "m"),)
+    given = (Coordinate("plane", "1"),)
+    usual = (1.0,)
+
+    def __init__(self, normals: Sequence[Sequence[float]] = ((0.0, 0.0, 1.0),)) -> None:
+        """The normal of each plane, roughly, in the measuring frame; the column `plane` numbers them from 1."""
+        axes = torch.tensor([list(map(float, n)) for n in normals], dtype=torch.float64)
+        if axes.dim() != 2 or axes.shape[-1] != 3 or bool((axes.norm(dim=-1) == 0).any()):
+            raise InputError(f"normals: write a direction x, y, z for each plane, not {normals!r}")
+        self.keys = {"normals": [list(n) for n in normals]}
+        full = torch.linalg.svd(axes[:, None], full_matrices=True)[2]
+        self.axes = torch.cat([axes[:, None] / axes.norm(dim=-1)[:, None, None], full[:, 1:]], 1)
+        self.unknown = tuple(f"plane{i + 1}" for i in range(len(axes)))
+        self.parameters = tuple(
+            Parameter(f"{name}_{part}", unit, 0.0, scale=scale)
+            for name in self.unknown
+            for part, unit, scale in (("height", "m", _PLACE), ("turn1", "rad", _TURN), ("turn2", "rad", _TURN))
+        )
+
+    def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
+        mine = _chosen(own, given[..., 0], 3)
+        axes = self.axes[_number(given[..., 0], len(self.axes))]
+        turn = (mine[..., 1:, None] * axes[..., 1:, :]).sum(-2)
+        normal = (rotation_vector_to_matrix(turn) @ axes[..., 0, :, None])[..., 0]
+        return (place.position * normal).sum(-1, keepdim=True) - mine[..., :1]
+
+
+class Level(Reading):
+    """An inclinometer or autocollimator's level: how far its x and y axes rise over the horizontal.
+
+    The measuring frame's z is up.
+    """
+
+    kind = "level"
+    turns = True
+    read = (Coordinate("tilt_x", "rad"), Coordinate("tilt_y", "rad"))
+    unknown = ("level",)
+
+    def __init__(self, mount: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        """How it sits on its link, roughly, a rotation vector [rad]."""
+        if len(mount) != 3:
+            raise InputError(f"mount: write a rotation vector of three numbers in rad, not {mount!r}")
+        self.keys = {"mount": list(mount)}
+        self.parameters = tuple(
+            Parameter(f"level_{axis}", "rad", float(v), scale=_TURN)
+            for axis, v in zip(("rx", "ry", "rz"), mount, strict=True)
+        )
+
+    def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
+        assert place.rotation is not None
+        up = (place.rotation @ rotation_vector_to_matrix(own))[..., 2, :2]
+        return torch.asin(up.clamp(-1 + 1e-12, 1 - 1e-12))
+
+
+class Encoder(Reading):
+    """A second encoder at the driven side of a joint: where the joint is, but for an offset."""
+
+    kind = "encoder"
+    unknown = ("encoder",)
+
+    def __init__(self, joint: str, joints: Sequence[Coordinate]) -> None:
+        """The joint; its column is the joint's name and `_second`."""
+        names = [j.name for j in joints]
+        if joint not in names:
+            raise InputError(f"joint: there is no joint {joint!r}; write one of {', '.join(names)}")
+        self.number = names.index(joint)
+        unit = joints[self.number].unit
+        self.keys = {"joint": joint}
+        self.read = (Coordinate(f"{joint}_second", unit),)
+        self.parameters = (Parameter("encoder_offset", unit, 0.0, scale=_PLACE if unit == "m" else _TURN),)
+
+    def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
+        return place.joints[..., self.number : self.number + 1] + own
+
+
+READINGS: dict[str, Callable[..., Reading]] = {c.kind: c for c in (Camera, Wire, Dial, Level, Encoder)}
+"""Instruments by name."""
+
+
+def make_reading(kind: str, keys: Mapping[str, Any], mechanism: Mechanism) -> Reading:
+    """An instrument by name, with its keys.
+
+    Raises:
+        InputError: a kind or key that is not known, or one that is missing.
+    """
+    if kind not in READINGS:
+        raise InputError(f"kind: there is no instrument {kind!r}; write one of {', '.join(READINGS)}")
+    takes = [name for name in inspect.signature(READINGS[kind]).parameters if name != "joints"]
+    wrong = [name for name in keys if name not in takes]
+    if wrong:
+        raise InputError(f"mechanism 'instrument': a {kind} has no key {wrong[0]!r}; it has {', '.join(takes)}")
+    more = {"joints": mechanism.joints} if kind == "encoder" else {}
+    try:
+        return READINGS[kind](**keys, **more)
+    except TypeError as reason:
+        raise InputError(f"mechanism 'instrument': {kind}: {reason}; its keys are {', '.join(takes)}") from None
+
+
+def _count(value: int, key: str) -> int:
+    if not isinstance(value, int) or not 1 <= value <= 100:
+        raise InputError(f"{key}: {value!r} is no number of them; write 1 to 100")
+    return value
+
+
+def _number(column: Tensor, count: int) -> Tensor:
+    """The number from 0 of each row's group; what is no group is the nearest."""
+    return (column.round() - 1).clamp(0, count - 1).to(torch.int64)
+
+
+def _chosen(own: Tensor, column: Tensor, width: int) -> Tensor:
+    """Of the parameters of all groups `... x (g w)` those of each row's, `... x w`."""
+    number = _number(column, own.shape[-1] // width)
+    lead = torch.broadcast_shapes(own.shape[:-1], number.shape)  # type: ignore[no-untyped-call]
+    index = (number[..., None] * width + torch.arange(width)).expand(*lead, width)
+    return own.expand(*lead, -1).gather(-1, index)
