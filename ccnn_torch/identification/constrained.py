@@ -40,7 +40,7 @@ from ccnn_torch.identification.problems.problem import joined
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
 from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
-from ccnn_torch.records.joint_map import read_joint_map, with_joints
+from ccnn_torch.records.commanded import read_joints
 from ccnn_torch.records.load import read_source
 
 # Links and noise are estimated in turn, the noise from this size on [m].
@@ -229,8 +229,8 @@ def _beside(config: IdentifyConfig, mechanism: Mechanism) -> tuple[list[Build], 
         if about.kind == "pose":
             rows = poses_of(config, about.records, mechanism)[0]
         else:
-            counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
-            table = with_joints(read_source(about.records, config.columns), counted)
+            source = read_source(about.records, config.columns)
+            table = read_joints(source, mechanism, config.joint_map, config.columns)
             rows = rows_of(table, mechanism, about, torch.arange(len(table)))
         found.append(_builder(about, mechanism, rows))
         counts.append(len(rows.joints))

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import newton as _numeric
+from ccnn_torch.mechanisms import branches as _branches, newton as _numeric
 from ccnn_torch.mechanisms.pose import (
     PoseError,
     coordinates_jacobian,
@@ -185,6 +185,21 @@ class Mechanism(nn.Module):
             (joints, self.resolve(parameters)),
             closest=len(self.joints) > len(self.pose),
         )
+
+    def controlled(self) -> Mechanism:
+        """The nominal machine as its controller has it: in its own base, at the tool that it was given."""
+        return self
+
+    def commanded_joints(self, pose: Tensor, guess: Tensor | None = None) -> Tensor:
+        """Joints for poses in the order commanded, `s x n` [SI]; NaN out of reach, rounding of the poses aside.
+
+        Where there are several, those nearest to the previous row's, in the first row to `home_joints`.
+
+        Args:
+            pose: `s x p` [SI].
+            guess: `s x n` [SI], joints on the branch to take.
+        """
+        return _branches.commanded_joints(self, pose, guess)
 
     def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
         """Its legs or links at one configuration as lines by name, `k x 3` [m] in the robot's frame; default: none.

@@ -14,16 +14,15 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
+from ccnn_torch.records.commanded import Moving, read_joints
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES, choose_covariates
 from ccnn_torch.records.headers import (
     HasCoordinates,
-    check_joints,
     check_orientation,
     read_pose as read_pose,
     stack_columns as stack_columns,
     unused_joints,
 )
-from ccnn_torch.records.joint_map import read_joint_map, with_joints
 from ccnn_torch.records.read_table import Frame, read_frame, read_table
 from ccnn_torch.records.table import FILE as FILE, Table, name_lines as name_lines, write_table as write_table
 from ccnn_torch.units import to_si
@@ -164,7 +163,7 @@ class Records:
 
 def load_records(
     source: Source | Records,
-    mechanism: HasCoordinates,
+    mechanism: Moving,
     covariates: Sequence[str] | None = None,
     learns: bool = True,
     columns: Mapping[str, str] | None = None,
@@ -172,9 +171,11 @@ def load_records(
 ) -> Records:
     """Load records for a mechanism.
 
-    Joint and pose columns are named as the mechanism names them. A serial arm (one that lists `orientations`) may have
-    its orientation as a rotation vector `rx, ry, rz`, as a quaternion `qw, qx, qy, qz`, as Euler angles
-    (`kuka_a, kuka_b, kuka_c`, `fanuc_w, fanuc_p, fanuc_r`, `staubli_rx, staubli_ry, staubli_rz`) or not at all; where a
+    Joint and pose columns are named as the mechanism names them. Where there are no joints, they are the nominal
+    inverse kinematics of the poses that were commanded, `goal_x`, `goal_y` … (`commanded.read_joints`). A serial arm
+    (one that lists `orientations`) may have its orientation as a rotation vector `rx, ry, rz`, as a quaternion
+    `qw, qx, qy, qz`, as Euler angles (`kuka_a, kuka_b, kuka_c`, `fanuc_w, fanuc_p, fanuc_r`,
+    `staubli_rx, staubli_ry, staubli_rz`) or not at all; where a
     file has several, the first of these counts. The covariates are by default the columns `time`, `temperature`,
     `load_*`, `direction*` and `speed*` that are there; `covariates` replaces this choice by names or patterns
     ([] = none). A constant covariate is dropped with a note. A column that is not used needs no unit.
@@ -195,8 +196,7 @@ def load_records(
     """
     if isinstance(source, Records):
         return _loaded(source, mechanism, covariates, columns or joint_map)
-    table = with_joints(read_source(source, columns), read_joint_map(joint_map or {}, mechanism.joints, columns))
-    check_joints(table, mechanism.joints)
+    table = read_joints(read_source(source, columns), mechanism, joint_map, columns)
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
     pose, coordinates, orientation, read = read_pose(table, mechanism, partial=True)
     used = {joint.name for joint in mechanism.joints} | set(read)

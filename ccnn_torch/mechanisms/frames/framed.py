@@ -96,6 +96,10 @@ class Framed(Mechanism):
         self.low.copy_(samples.amin(0) - 1e-6)
         self.high.copy_(samples.amax(0) + 1e-6)
 
+    def controlled(self) -> Mechanism:
+        """As of the mechanism inside."""
+        return self.mechanism.controlled()
+
     def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
         """Samples of the mechanism, as the measuring device sees them; `count x p` [SI]."""
         return self._seen(self.mechanism.sample_workspace(count, generator), self.nominal)

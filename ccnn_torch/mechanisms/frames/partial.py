@@ -72,6 +72,10 @@ class Partial(Mechanism):
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 6` or `x 3`."""
         return frame_gap(self.frame(self.forward_kinematics(joints, parameters, pose)), self.frame(pose), 1.0)
 
+    def controlled(self) -> Mechanism:
+        """As of the mechanism inside."""
+        return self.mechanism.controlled()
+
     def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
         """What is seen of samples of the mechanism; `count x p` [SI]."""
         return self.mechanism.sample_workspace(count, generator)[..., self.seen]
