@@ -16,6 +16,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.records import load_records, write_table
 from ccnn_torch.records.read_table import read_table
+from ccnn_torch.starter import starter_config
 
 Array = NDArray[np.float64]
 Cli = Callable[..., tuple[int, str, str]]
@@ -176,3 +177,13 @@ def test_a_coordinate_that_a_machine_cannot_move_is_not_needed(tmp_path: Path) -
     write_table(tmp_path / "r.csv", columns(place, "goal_{}") | columns(place, "{}"))
     found = load_records(tmp_path / "r.csv", gantry, learns=False)
     np.testing.assert_allclose(found.joints.numpy(), place / 1e3, atol=1e-9)
+
+
+def test_new_recognises_a_commanded_pose(tmp_path: Path) -> None:
+    place = places(20, 6)
+    write_table(tmp_path / "r.csv", {f"Cmd_{c}": place[:, k] for k, c in enumerate("XYZ")} | columns(place, "{}"))
+    text, ready = starter_config(tmp_path / "r.csv", tmp_path / "c.yaml", "delta_linear", "mm,deg")
+    assert ready and '"Cmd_X": "goal_x[mm]"' in text and "inverse kinematics of the commanded pose" in text
+    write_table(tmp_path / "r.csv", columns(place, "{}"))
+    with pytest.raises(InputError, match=r"no column looks like a joint .* or a commanded pose \(goal_x"):
+        starter_config(tmp_path / "r.csv", tmp_path / "c.yaml")
