@@ -280,8 +280,24 @@ class Mechanism(nn.Module):
         return self.solve_inverse(pose, parameters, guess)
 
     def pose_error(self, measured: Tensor, reference: Tensor) -> PoseError:
-        """Distance [m] and geodesic angle [rad] between two poses, `... x p` each."""
-        return pose_error(self.frame(measured), self.frame(reference))
+        """Distance [m] and geodesic angle [rad] between two poses, `... x p` each.
+
+        What one of them lacks (NaN) does not count; where it lacks all lengths or all angles, that error is NaN.
+        """
+        lacking = measured.isnan() | reference.isnan()
+        if not bool(lacking.any()):
+            return pose_error(self.frame(measured), self.frame(reference))
+        whole = torch.where(measured.isnan(), reference, measured), torch.where(reference.isnan(), measured, reference)
+        found = pose_error(*(self.frame(pose) for pose in whole))
+        position, rotation = (
+            error if error is None or not kind else torch.where(lacking[..., kind].all(-1), torch.nan, error)
+            for error, kind in (
+                (error, [k for k, c in enumerate(self.pose) if c.unit == unit])
+                for error, unit in zip(found, ("m", "rad"), strict=True)
+            )
+        )
+        assert position is not None
+        return PoseError(position, rotation)
 
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Derivative of position and (with orientation) rotation vector in the base frame; joints `... x n`.

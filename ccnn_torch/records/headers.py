@@ -203,11 +203,16 @@ class HasCoordinates(Protocol):
     def orientations(self) -> tuple[str, ...]: ...
 
 
-def stack_columns(table: Table, coordinates: Sequence[Coordinate], angle_limit: float = np.inf) -> NDArray[np.float64]:
-    """Columns side by side, `rows x len(coordinates)`; refuses angles in rad beyond `angle_limit`."""
+def stack_columns(
+    table: Table, coordinates: Sequence[Coordinate], angle_limit: float = np.inf, gaps: bool = False
+) -> NDArray[np.float64]:
+    """Columns side by side, `rows x len(coordinates)`; refuses angles in rad beyond `angle_limit`.
+
+    With `gaps` cells may be empty, and NaN stands for them.
+    """
     values = np.empty((len(table), len(coordinates)))
     for k, coordinate in enumerate(coordinates):
-        values[:, k] = table.column(coordinate.name, coordinate.unit)
+        values[:, k] = table.column(coordinate.name, coordinate.unit, gaps)
         far = np.flatnonzero(np.abs(values[:, k]) > angle_limit)
         if table.units[coordinate.name] == "rad" and len(far):
             raise InputError(
@@ -225,7 +230,8 @@ def read_pose(
     A rotation vector counts before a quaternion, and that before Euler angles, where a file has several.
 
     Args:
-        partial: whether some of the pose coordinates are enough.
+        partial: whether some of the pose coordinates are enough: columns may be missing or empty, and so may cells, for
+            which NaN stands; of an orientation all three are NaN then.
         named: what the columns are called, with the coordinate's name in the place of the braces.
 
     Raises:
@@ -233,12 +239,14 @@ def read_pose(
     """
 
     def stacked(coordinates: Sequence[Coordinate], limit: float = np.inf) -> NDArray[np.float64]:
-        return stack_columns(table, [Coordinate(named.format(c.name), c.unit) for c in coordinates], limit)
+        return stack_columns(table, [Coordinate(named.format(c.name), c.unit) for c in coordinates], limit, partial)
 
+    if partial:
+        table = _without_empty(table, mechanism)
     if not mechanism.orientations:
         pose = _measured(table, mechanism.pose, mechanism) if partial else mechanism.pose
         pose = tuple(pose or mechanism.pose)
-        return stacked(pose, _POSE_LIMIT), pose, None, tuple(named.format(c.name) for c in pose)
+        return _together(stacked(pose, _POSE_LIMIT), pose), pose, None, tuple(named.format(c.name) for c in pose)
     position = tuple(c for c in mechanism.pose if c.name not in _ROTATION_VECTOR)
     turns = tuple(Coordinate(name, "rad") for name in _ROTATION_VECTOR)
     forms = {"rotation_vector": _ROTATION_VECTOR, "quaternion": _QUATERNION}
@@ -250,19 +258,42 @@ def read_pose(
     read = tuple(named.format(name) for name in (*(c.name for c in position), *forms.get(form, ())))
     full = (*position, *turns)
     if form == "rotation_vector":
-        return stacked(full, _POSE_LIMIT), full, form, read
+        return _together(stacked(full, _POSE_LIMIT), full), full, form, read
     where = stacked(position)
     if form == "none":
         return where, position, form, read
     # Imported here: few files need it, and the import takes long.
     from scipy.spatial.transform import Rotation
 
+    vector = np.full((len(table), 3), np.nan)
     if form == "quaternion":
-        turn = Rotation.from_quat(_quaternions(table, read[-4:])[:, [1, 2, 3, 0]])
+        values = _quaternions(table, read[-4:], partial)[:, [1, 2, 3, 0]]
+        known = np.isfinite(values).all(1)
+        turn = Rotation.from_quat(values[known])
     else:
         columns, axes = EULER_ANGLES[form]
-        turn = Rotation.from_euler(axes, stacked([Coordinate(name, "rad") for name in columns], _POSE_LIMIT))
-    return np.concatenate([where, turn.as_rotvec()], axis=1), full, form, read
+        values = stacked([Coordinate(name, "rad") for name in columns], _POSE_LIMIT)
+        known = np.isfinite(values).all(1)
+        turn = Rotation.from_euler(axes, values[known])
+    vector[known] = turn.as_rotvec()
+    return np.concatenate([where, vector], axis=1), full, form, read
+
+
+def _without_empty(table: Table, mechanism: HasCoordinates) -> Table:
+    """The table without columns of a pose whose cells are all empty."""
+    names = {c.name for c in mechanism.pose}
+    names |= {*_ROTATION_VECTOR, *_QUATERNION, *(name for columns, _ in EULER_ANGLES.values() for name in columns)}
+    return table.without([name for name in table.names if name in names and table.blank(name).all()])
+
+
+def _together(pose: NDArray[np.float64], coordinates: Sequence[Coordinate]) -> NDArray[np.float64]:
+    """The pose with all of rx, ry, rz NaN where one of them is: a rotation vector means nothing in part."""
+    names = [c.name for c in coordinates]
+    if set(_ROTATION_VECTOR) <= set(names):
+        turns = [names.index(name) for name in _ROTATION_VECTOR]
+        # One NaN makes the sum NaN.
+        pose[:, turns] += 0 * pose[:, turns].sum(1, keepdims=True)
+    return pose
 
 
 def pose_columns(pose: NDArray[np.float64], form: str | None) -> dict[str, NDArray[np.float64]]:
@@ -360,8 +391,8 @@ def unused_joints(table: Table, joints: Sequence[Coordinate], unused: Iterable[s
     return [name for name in unused if name in alike]
 
 
-def _quaternions(table: Table, names: Sequence[str]) -> NDArray[np.float64]:
-    quaternion = stack_columns(table, [Coordinate(name, "1") for name in names])
+def _quaternions(table: Table, names: Sequence[str], gaps: bool) -> NDArray[np.float64]:
+    quaternion = stack_columns(table, [Coordinate(name, "1") for name in names], gaps=gaps)
     norm = np.linalg.norm(quaternion, axis=1)
     # Written with three digits a unit quaternion is within 0.001 of norm 1; ten times that is no quaternion.
     wrong = np.flatnonzero(np.abs(norm - 1) > 0.01)

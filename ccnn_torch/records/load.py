@@ -119,7 +119,7 @@ class Records:
     Attributes:
         path: the file; several with commas between them.
         joints: commanded joints, `rows x n`.
-        pose: measured pose, `rows x p`, the columns as in `pose_coordinates`.
+        pose: measured pose, `rows x p`, the columns as in `pose_coordinates`; NaN where a cell is empty.
         covariates: further inputs, `rows x m`, the columns as in `covariate_coordinates`.
         joint_coordinates, pose_coordinates, covariate_coordinates: names and SI units. The pose is the mechanism's,
             less the orientation where it was not measured.
@@ -153,8 +153,14 @@ class Records:
 
     @property
     def positions(self) -> Tensor:
-        """The pose coordinates that are lengths, `rows x d` [m]."""
-        return self.pose[:, [k for k, coordinate in enumerate(self.pose_coordinates) if coordinate.unit == "m"]]
+        """The pose coordinates that are lengths, `rows x d` [m]; the mean where one was not measured."""
+        found = self.pose[:, [k for k, coordinate in enumerate(self.pose_coordinates) if coordinate.unit == "m"]]
+        return torch.where(found.isnan(), found.nanmean(0), found)
+
+    @property
+    def whole(self) -> Tensor:
+        """Rows whose pose was measured in all its coordinates, `rows`, bool."""
+        return ~self.pose.isnan().any(-1)
 
     def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
         """Rows (0-based) by their lines in the file, e.g. "line 17 (row 16)"."""
@@ -199,6 +205,7 @@ def load_records(
     table = read_joints(read_source(source, columns), mechanism, joint_map, columns)
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
     pose, coordinates, orientation, read = read_pose(table, mechanism, partial=True)
+    gaps = _gaps(table, pose, coordinates)
     used = {joint.name for joint in mechanism.joints} | set(read)
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
@@ -219,6 +226,7 @@ def load_records(
         shown = ", ".join(c.name for c in coordinates)
         notes.append(f"of the pose only {shown} was measured; what moves nothing else is not seen")
     notes = [
+        *gaps,
         *(f"joint '{name}' is constant and carries no information" for name in still),
         *notes,
         *table.notes,
@@ -261,7 +269,7 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
         reachable = getattr(mechanism, "reachable", None)
         if reachable is None or len(records.pose_coordinates) != len(mechanism.pose):
             return
-        outside = np.flatnonzero(~reachable(records.pose).numpy())
+        outside = np.flatnonzero((records.whole & ~reachable(records.pose)).numpy())
         if len(outside):
             raise InputError(
                 f"{records.path}: the pose at {records.name_rows(outside)} is outside the workspace of "
@@ -282,6 +290,31 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
             f"move ({limit:.3g} m, twice its reach and tool); "
             f"correct or remove {'it' if len(outside) == 1 else 'them'}, or check the units"
         )
+
+
+def _gaps(table: Table, pose: NDArray[np.float64], coordinates: Sequence[Coordinate]) -> list[str]:
+    """Sentences on coordinates that were not measured in some rows.
+
+    Raises:
+        InputError: a row has none of them.
+    """
+    missing = np.isnan(pose)
+    empty = np.flatnonzero(missing.all(1))
+    if len(empty):
+        shown = ", ".join(c.name for c in coordinates)
+        raise InputError(
+            f"{table.path}: nothing of the pose was measured at {table.name_rows(empty)}; remove "
+            f"{'it' if len(empty) == 1 else 'them'}, or write what was measured of {shown}"
+        )
+    counts: dict[int, list[str]] = {}
+    for count, coordinate in zip(missing.sum(0).tolist(), coordinates, strict=True):
+        counts.setdefault(count, []).append(coordinate.name)
+    return [
+        f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} missing in {count} of {len(table)} rows, which count "
+        "with what was measured"
+        for count, names in counts.items()
+        if count
+    ]
 
 
 def _loaded(

@@ -167,8 +167,12 @@ class Framed(Mechanism):
         return self.mechanism.lacking(conditions)
 
     def inlying_frames(self, joints: Tensor, pose: Tensor, weights: Tensor | None = None) -> Tensor:
-        """As `fitted_frames` to the rows that are no gross outliers; weights: `... x s`, 0 leaves a row out."""
+        """As `fitted_frames` to the rows that are no gross outliers; weights: `... x s`, 0 leaves a row out.
+
+        A row that lacks a part of its pose (NaN) is left out.
+        """
         weights = torch.ones(joints.shape[:-1], dtype=joints.dtype) if weights is None else weights
+        weights, pose = torch.where(pose.isnan().any(-1), 0.0, weights), pose.nan_to_num()
         fine = weights
         for _ in range(3):
             values = self.fitted_frames(joints, self.frame(pose), fine)

@@ -170,6 +170,13 @@ class Partial(Mechanism):
         return rows * weight
 
 
+def completed(mechanism: Mechanism, joints: Tensor, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+    """Poses `... x p` with what was not measured (NaN) as the machine has it at the joints."""
+    if not bool(pose.isnan().any()):
+        return pose
+    return torch.where(pose.isnan(), mechanism.forward_kinematics(joints, parameters), pose)
+
+
 def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "records") -> Mechanism:
     """The mechanism as records with these pose coordinates show it: itself, an arm by positions alone, or `Partial`.
 
