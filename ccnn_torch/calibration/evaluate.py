@@ -13,6 +13,7 @@ from ccnn_torch.calibration.rows.prepare import Prepared
 from ccnn_torch.compensation import Compensator
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 # The fixed point q = q* - δ(q) gains a factor of the Lipschitz constant of δ each time, about 1e-3 for real machines.
@@ -150,7 +151,7 @@ def _model(prepared: Prepared, repeat: int, moved: Tensor) -> Tensor:
     """Frame of the model's pose at command and what was learned there, `s x n`, as `_vectors`."""
     if prepared.physics is not None:
         return prepared.physics.frames(repeat, moved)
-    guess = prepared.pose[repeat]
+    guess = completed(prepared.mechanism, moved, prepared.pose[repeat], _parameters(prepared, repeat))
     return _vectors(prepared, prepared.mechanism.forward_kinematics(moved, _parameters(prepared, repeat), guess))
 
 
@@ -170,4 +171,7 @@ def _apart(there: Tensor, here: Tensor) -> Tensor:
 
 
 def _error(apart: Tensor) -> PoseError:
-    return PoseError(apart[..., :3].norm(dim=-1), apart[..., 3:].norm(dim=-1) if apart.shape[-1] == 6 else None)
+    """Of what was measured; NaN where nothing of the kind was."""
+    parts = [apart[..., :3], apart[..., 3:]] if apart.shape[-1] == 6 else [apart]
+    sizes = [torch.where(p.isnan().all(-1), torch.nan, p.nan_to_num().norm(dim=-1)) for p in parts]
+    return PoseError(sizes[0], sizes[1] if len(sizes) == 2 else None)

@@ -162,6 +162,19 @@ class Records:
         """Rows whose pose was measured in all its coordinates, `rows`, bool."""
         return ~self.pose.isnan().any(-1)
 
+    @property
+    def missing(self) -> list[str]:
+        """Sentences on coordinates of the pose that were not measured in some rows."""
+        counts: dict[int, list[str]] = {}
+        for count, coordinate in zip(self.pose.isnan().sum(0).tolist(), self.pose_coordinates, strict=True):
+            counts.setdefault(count, []).append(coordinate.name)
+        return [
+            f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} missing in {count} of {len(self)} rows, which "
+            "count with what was measured"
+            for count, names in counts.items()
+            if count
+        ]
+
     def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
         """Rows (0-based) by their lines in the file, e.g. "line 17 (row 16)"."""
         return name_lines(self.lines, rows, parts=self.parts)
@@ -205,7 +218,7 @@ def load_records(
     table = read_joints(read_source(source, columns), mechanism, joint_map, columns)
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
     pose, coordinates, orientation, read = read_pose(table, mechanism, partial=True)
-    gaps = _gaps(table, pose, coordinates)
+    _refuse_empty(table, pose, coordinates)
     used = {joint.name for joint in mechanism.joints} | set(read)
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
@@ -226,7 +239,6 @@ def load_records(
         shown = ", ".join(c.name for c in coordinates)
         notes.append(f"of the pose only {shown} was measured; what moves nothing else is not seen")
     notes = [
-        *gaps,
         *(f"joint '{name}' is constant and carries no information" for name in still),
         *notes,
         *table.notes,
@@ -236,7 +248,7 @@ def load_records(
         notes.append(
             f"columns {', '.join(alike)} look like joints and are not used; {mechanism.name} has no such joint"
         )
-    return Records(
+    records = Records(
         path=table.path,
         joints=torch.from_numpy(joints),
         pose=torch.from_numpy(pose),
@@ -252,6 +264,7 @@ def load_records(
         data_hash=table.data_hash,
         parts=table.parts,
     )
+    return replace(records, notes=[*records.missing, *notes])
 
 
 def check_rows(records: Records, mechanism: HasCoordinates) -> None:
@@ -292,29 +305,15 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
         )
 
 
-def _gaps(table: Table, pose: NDArray[np.float64], coordinates: Sequence[Coordinate]) -> list[str]:
-    """Sentences on coordinates that were not measured in some rows.
-
-    Raises:
-        InputError: a row has none of them.
-    """
-    missing = np.isnan(pose)
-    empty = np.flatnonzero(missing.all(1))
+def _refuse_empty(table: Table, pose: NDArray[np.float64], coordinates: Sequence[Coordinate]) -> None:
+    """Raise `InputError` where a row has nothing of the pose."""
+    empty = np.flatnonzero(np.isnan(pose).all(1))
     if len(empty):
         shown = ", ".join(c.name for c in coordinates)
         raise InputError(
             f"{table.path}: nothing of the pose was measured at {table.name_rows(empty)}; remove "
             f"{'it' if len(empty) == 1 else 'them'}, or write what was measured of {shown}"
         )
-    counts: dict[int, list[str]] = {}
-    for count, coordinate in zip(missing.sum(0).tolist(), coordinates, strict=True):
-        counts.setdefault(count, []).append(coordinate.name)
-    return [
-        f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} missing in {count} of {len(table)} rows, which count "
-        "with what was measured"
-        for count, names in counts.items()
-        if count
-    ]
 
 
 def _loaded(
