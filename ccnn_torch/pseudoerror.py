@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism, PoseError
+from ccnn_torch.mechanisms.frames.partial import completed
 
 # Rows x repeats solved at once: about 100 MB for a six-joint arm.
 _CHUNK = 20_000
@@ -21,8 +22,8 @@ class Pseudoerror:
     Attributes:
         deviation: δ = g(X) - q_c, `[r x] s x n` [SI], revolute joints in [-pi, pi]; 0 where the pose has no joints.
         usable: rows fit to learn from, `[r x] s`, bool.
-        reasons: why rows are not, by "unreachable", "condition" and "deviation", beside an identified machine also
-            "outlier"; each `[r x] s`, bool.
+        reasons: why rows are not, by "unreachable", "condition" and "deviation", where poses have gaps also "partial",
+            beside an identified machine "outlier"; each `[r x] s`, bool.
         condition: condition number of the Jacobian at the commanded joints, `[r x] s` [1].
         remainder_position: what no joint deviation compensates, `[r x] s` [m].
         remainder_rotation: the same of the orientation, `[r x] s` [rad], or None.
@@ -35,9 +36,15 @@ class Pseudoerror:
     remainder_position: Tensor
     remainder_rotation: Tensor | None
 
+    @property
+    def known(self) -> Tensor:
+        """Rows that a machine may be identified from, `[r x] s`, bool: also those with a part of their pose."""
+        return self.usable | self.reasons.get("partial", torch.zeros_like(self.usable))
+
     def notes(self, max_named: int = 10) -> list[str]:
         """One sentence per reason, naming the first rows (counted from 1); a row counts if it is so in any repeat."""
         sentences = {
+            "partial": "a part of their pose was not measured; geometry is identified from them, too, and they judge",
             "unreachable": "no joints of the nominal mechanism reach the measured pose",
             "condition": "the arm is near a singularity, where a small pose error needs a large joint deviation",
             "deviation": "the joint deviation is larger than max_deviation",
@@ -71,7 +78,7 @@ def joint_deviations(
     Args:
         mechanism: nominal kinematics.
         commanded: `[r x] s x n` [SI].
-        measured: `[r x] s x p` [SI].
+        measured: `[r x] s x p` [SI]; rows that lack a part of it (NaN) are not usable.
         parameters: `k`, or `r x 1 x k` for one set per repeat (fitted frames), or `[r x] s x k` for one per row (frames
             per group of rows); nominal when None.
         rotation_weight: η of eq. 5 [m/rad]; the paper's 10..40 mm.
@@ -85,6 +92,8 @@ def joint_deviations(
     Returns:
         Pseudoerror.
     """
+    partial = measured.isnan().any(-1) & ~measured.isnan().all(-1)
+    measured = completed(mechanism, commanded, measured, parameters) if bool(partial.any()) else measured
     rows = commanded.shape[-2]
     by_row = parameters is not None and parameters.dim() > 1 and parameters.shape[-2] == rows > 1
     sets = (t.shape[:-2] for t in (commanded, measured, parameters) if t is not None)
@@ -100,14 +109,17 @@ def joint_deviations(
     turned = [p[2].rotation for p in parts if p[2].rotation is not None]
     reached = torch.isfinite(deviation).all(-1)
     largest = deviation.abs().amax(-1)
+    partial = partial.expand(reached.shape)
+    reached = reached & ~partial
     reasons = {
-        "unreachable": ~reached,
+        **({"partial": partial} if bool(partial.any()) else {}),
+        "unreachable": ~reached & ~partial,
         "condition": reached & ~(condition <= max_condition),
         "deviation": reached & (largest > (math.inf if max_deviation is None else max_deviation)),
     }
     return Pseudoerror(
         deviation=torch.where(reached[..., None], deviation, 0.0),
-        usable=~(reasons["unreachable"] | reasons["condition"] | reasons["deviation"]),
+        usable=~(partial | reasons["unreachable"] | reasons["condition"] | reasons["deviation"]),
         reasons=reasons,
         condition=condition,
         remainder_position=position,

@@ -17,6 +17,7 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.mechanisms.frames.judge import coupled_count
 from ccnn_torch.mechanisms.registry import REGISTRY
 from ccnn_torch.records import DEFAULT_COVARIATES
+from ccnn_torch.records.commanded import GOAL
 from ccnn_torch.records.headers import EULER_ANGLES
 from ccnn_torch.records.load import load_records, read_source
 from ccnn_torch.records.table import Table
@@ -36,6 +37,8 @@ _TURNS = (
     (("a", "b", "c"), EULER_ANGLES["kuka"][0]),
     (("w", "p", "r"), EULER_ANGLES["fanuc"][0]),
 )
+# How others call the coordinates of a commanded pose, before or after the coordinate.
+_GOALS = ("goal", "commanded", "command", "cmd", "target", "soll")
 # Mechanisms whose number of joints or frames does not follow from headers.
 _OPEN = ("serial", "framed", "partial")
 
@@ -45,7 +48,7 @@ class Recognised:
     """Columns that have a meaning, and the rest.
 
     Attributes:
-        meaning: name in the file -> our name, joints first.
+        meaning: name in the file -> our name, joints first; where there are none, with the commanded pose, `goal_x` ….
         joints: how many joints.
         unknown: names in the file that mean nothing here.
         inputs: name in the file -> our header of a time, a temperature and directions under another name.
@@ -59,10 +62,16 @@ class Recognised:
     @property
     def pose(self) -> set[str]:
         """Our names of the pose columns that are there."""
-        return {name for name in self.meaning.values() if not re.fullmatch(r"q\d+", name)}
+        return {name for name in self.meaning.values() if not re.fullmatch(r"q\d+|goal_.+", name)}
+
+    @property
+    def goals(self) -> dict[str, str]:
+        """Columns of a commanded pose: name in the file -> our name."""
+        return {name: ours for name, ours in self.meaning.items() if ours.startswith(GOAL)}
 
     def unit_kind(self, name: str, machine: Mechanism | None) -> str:
         """SI unit that a column of ours is in: `m`, `rad` or `1`."""
+        name = name.removeprefix(GOAL)
         known = {} if machine is None else {c.name: c.unit for c in (*machine.joints, *machine.pose)}
         if name in known:
             return known[name]
@@ -89,9 +98,30 @@ def recognise(table: Table) -> Recognised:
         if all(plain in by_plain for plain in plains):
             meaning |= dict(zip((by_plain[plain] for plain in plains), ours, strict=True))
             break
+    if not family:
+        meaning |= _goals(by_plain, wanted)
     inputs = _inputs(table, {name: plain for name, plain in folded.items() if name not in meaning}, len(family))
     known = meaning.keys() | inputs.keys()
     return Recognised(meaning, len(family), [name for name in table.names if name not in known], inputs)
+
+
+def _goals(by_plain: Mapping[str, str], wanted: set[str]) -> dict[str, str]:
+    """Name in the file -> our name of the coordinates of a commanded pose; by_plain: plain name -> name in the file."""
+    single = {ours.replace("_", ""): ours for ours in sorted(wanted)}
+    for word in _GOALS:
+        there = {
+            plain.removeprefix(word) if plain.startswith(word) else plain.removesuffix(word): name
+            for plain, name in by_plain.items()
+            if plain.startswith(word) or plain.endswith(word)
+        }
+        found = {there[plain]: GOAL + ours for plain, ours in single.items() if plain in there}
+        for theirs, ours in _TURNS:
+            if all(name.replace("_", "") in there for name in theirs):
+                names = (there[name.replace("_", "")] for name in theirs)
+                return found | {name: GOAL + own for name, own in zip(names, ours, strict=True)}
+        if found:
+            return found
+    return {}
 
 
 def _inputs(table: Table, folded: Mapping[str, str], joints: int) -> dict[str, str]:
@@ -122,7 +152,8 @@ def suitable_mechanisms(found: Recognised, table: Table) -> list[str]:
         if name in _OPEN:
             continue
         machine = load_mechanism(name)
-        wanted = {c.name: c.unit for c in (*machine.joints, *machine.pose)}
+        wanted = {c.name: c.unit for c in (*(() if found.goals else machine.joints), *machine.pose)}
+        wanted |= {GOAL + c.name: c.unit for c in machine.pose} if found.goals else {}
         if set(wanted) == set(theirs) and all(_fits(theirs[ours], unit) for ours, unit in wanted.items()):
             fitting.append(name)
     return fitting
@@ -211,8 +242,10 @@ def starter_config(
     """
     table = read_source(records)
     found = recognise(table)
-    if not found.joints or not found.pose:
-        what = "joint (q1, J1, A1, joint_1 …)" if not found.joints else "measured pose (x, y, z …)"
+    if not (found.joints or found.goals) or not found.pose:
+        what = "measured pose (x, y, z …)"
+        if not (found.joints or found.goals):
+            what = "joint (q1, J1, A1, joint_1 …) or a commanded pose (goal_x, goal_y …)"
         raise InputError(
             f"{records}: no column looks like a {what}; it has {', '.join(table.names)}: rename columns, or write the "
             "config by hand (docs/how_to/records.md)"
@@ -226,6 +259,7 @@ def starter_config(
         f"records: {json.dumps(_relative(records, out), ensure_ascii=False)}",
         *_mechanism_lines(name, why, out),
         *_column_lines(columns, found, table),
+        *(["# No joints: they are the nominal inverse kinematics of the commanded pose."] if found.goals else []),
         *_count_lines(columns, found, table, machine, records),
         f"split: {split}   # {reason}",
         *_other_lines(found, table),
@@ -248,7 +282,7 @@ def _machine(
     if given is None:
         return None, None, ", ".join(suitable_mechanisms(found, table))
     machine = load_mechanism(given)
-    if len(machine.joints) != found.joints:
+    if not found.goals and len(machine.joints) != found.joints:
         raise InputError(
             f"--mechanism {given}: it has {len(machine.joints)} joints, and {table.path} has columns for "
             f"{found.joints}; give the mechanism of these records"
@@ -279,10 +313,10 @@ def _split(found: Recognised, table: Table, columns: dict[str, str]) -> tuple[st
     """Split as YAML and why."""
     places = [name for name, ours in found.meaning.items() if ours in ("x", "y", "z")]
     values = [to_si(table.raw(n), columns[n].rpartition("[")[2].rstrip("]"), where=n) for n in places]
-    goals = [name for name in found.unknown if name.startswith("goal_")]
+    goals = {name: name for name in found.unknown if name.startswith(GOAL)} | found.goals
     return choose_split(
         np.stack(values, axis=-1) if values else None,
-        goals,
+        [*goals.values()],
         np.stack([table.raw(name) for name in goals], axis=-1) if goals else None,
     )
 

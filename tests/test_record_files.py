@@ -223,8 +223,9 @@ def test_a_frame_and_loaded_records(tmp_path: Path) -> None:
     frame["note"] = pd.array([None, "a"] * (ROWS // 2), dtype="string")
     frame["y[mm]"] = frame["y[mm]"].astype("Float64")
     same(load_records([frame.iloc[:5], frame.iloc[5:]], Slide()), from_file)
-    frame.loc[2, "y[mm]"] = pd.NA
-    refused(frame, "DataFrame: column 'y' is empty at line 4 (row 3)")
+    frame["q1[mm]"] = frame["q1[mm]"].astype("Float64")
+    frame.loc[2, "q1[mm]"] = pd.NA
+    refused(frame, "DataFrame: column 'q1' is empty at line 4 (row 3)")
     refused(frame.iloc[:0], "no row")
     refused(7, "a int holds none")
 

@@ -222,8 +222,15 @@ def test_missing_unit_of_a_known_column_gets_the_right_remedy(tmp_path: Path) ->
         load_records(path, Arm())
 
 
-@pytest.mark.parametrize("header", ["q1[mm]", "y[mm]", "temperature[degC]"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+# An empty cell of the pose was not measured (tests/test_missing_cells.py).
+@pytest.mark.parametrize(
+    ("header", "value"),
+    [
+        ("q1[mm]", np.nan),
+        ("temperature[degC]", np.nan),
+        *((h, np.inf) for h in ("q1[mm]", "y[mm]", "temperature[degC]")),
+    ],
+)
 def test_not_finite(tmp_path: Path, header: str, value: float) -> None:
     columns = slide_columns()
     columns[header] = columns[header].copy()

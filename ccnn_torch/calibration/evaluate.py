@@ -13,6 +13,7 @@ from ccnn_torch.calibration.rows.prepare import Prepared
 from ccnn_torch.compensation import Compensator
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import PoseError, Seen
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 # The fixed point q = q* - δ(q) gains a factor of the Lipschitz constant of δ each time, about 1e-3 for real machines.
@@ -55,7 +56,7 @@ def pose_before(prepared: Prepared) -> PoseError:
     """
     if prepared.simulation is not None:
         return prepared.simulation.pose_errors(prepared.joints)[0]
-    nominal = prepared.mechanism.forward_kinematics(prepared.joints, prepared.parameters, prepared.pose)
+    nominal = prepared.mechanism.forward_kinematics(prepared.joints, prepared.parameters, _given(prepared))
     return prepared.mechanism.pose_error(prepared.pose, nominal)
 
 
@@ -63,7 +64,7 @@ def pose_with_geometry(prepared: Prepared) -> PoseError | None:
     """Pose error that geometric calibration alone leaves, `r x s`; None where no geometry was fitted."""
     if prepared.identified is None:
         return None
-    reached = prepared.mechanism.forward_kinematics(prepared.joints, prepared.identified, prepared.pose)
+    reached = prepared.mechanism.forward_kinematics(prepared.joints, prepared.identified, _given(prepared))
     return prepared.mechanism.pose_error(prepared.pose, reached)
 
 
@@ -123,7 +124,9 @@ def _of_records(
         with torch.no_grad():
             solved = found[k].solve(joints, covariates)
             moved = solved.command + found[k].learned(solved.command, covariates)
-        nominal = prepared.mechanism.forward_kinematics(joints, _wanted(prepared, k), prepared.pose[k])
+        given = _given(prepared)
+        about = (_wanted(prepared, k), None if given is None else given[k])
+        nominal = prepared.mechanism.forward_kinematics(joints, *about)
         wanted = _vectors(prepared, nominal)
         reached.append(_apart(_model(prepared, k, moved), wanted) + rest)
         damped += float((solved.status == 3).double().mean()) / len(prepared.joints)
@@ -147,6 +150,11 @@ def _parameters(prepared: Prepared, repeat: int) -> Tensor | None:
     return None if prepared.parameters is None else prepared.parameters[repeat]
 
 
+def _given(prepared: Prepared) -> Tensor | None:
+    """The rows where they say what an instrument was pointed at, `r x s x p`."""
+    return prepared.pose if prepared.mechanism.compared < prepared.pose.shape[-1] else None
+
+
 def _wanted(prepared: Prepared, repeat: int) -> Tensor | None:
     """The same as the model's instrument shows it: a focal length is no error of the machine."""
     nominal, mechanism = _parameters(prepared, repeat), prepared.mechanism
@@ -161,7 +169,7 @@ def _model(prepared: Prepared, repeat: int, moved: Tensor) -> Tensor:
     """Frame of the model's pose at command and what was learned there, `s x n`, as `_vectors`."""
     if prepared.physics is not None:
         return prepared.physics.frames(repeat, moved)
-    guess = prepared.pose[repeat]
+    guess = completed(prepared.mechanism, moved, prepared.pose[repeat], _parameters(prepared, repeat))
     return _vectors(prepared, prepared.mechanism.forward_kinematics(moved, _parameters(prepared, repeat), guess))
 
 
@@ -181,4 +189,7 @@ def _apart(there: Tensor, here: Tensor) -> Tensor:
 
 
 def _error(apart: Tensor) -> PoseError:
-    return PoseError(apart[..., :3].norm(dim=-1), apart[..., 3:].norm(dim=-1) if apart.shape[-1] == 6 else None)
+    """Of what was measured; NaN where nothing of the kind was."""
+    parts = [apart[..., :3], apart[..., 3:]] if apart.shape[-1] == 6 else [apart]
+    sizes = [torch.where(p.isnan().all(-1), torch.nan, p.nan_to_num().norm(dim=-1)) for p in parts]
+    return PoseError(sizes[0], sizes[1] if len(sizes) == 2 else None)

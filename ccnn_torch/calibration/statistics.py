@@ -191,7 +191,10 @@ def pose_block(
 
 
 def _rms_and_max(errors: NDArray[np.float64], weights: ArrayLike | None) -> RmsMax:
-    values, weight = _rows(errors[..., None], weights, (Coordinate("error", "1"),))
+    # Rows of which nothing of the kind was measured do not count.
+    known = ~np.isnan(errors)
+    weights = known * (1.0 if weights is None else _array(weights))
+    values, weight = _rows(np.nan_to_num(errors)[..., None], weights, (Coordinate("error", "1"),))
     values = values[..., 0]
     rms = np.sqrt((np.square(values) * weight).sum(1) / weight.sum(1))
     return RmsMax(rms=spread(rms), max=spread(np.where(weight > 0, values, -np.inf).max(1)))

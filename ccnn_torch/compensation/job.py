@@ -19,20 +19,18 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError
 from ccnn_torch.files.read import parse_json, read_text
 from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
+from ccnn_torch.mechanisms.branches import EXACT, ROUNDED, arrives, follow
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.plugins import code_refused
-from ccnn_torch.records.headers import columns_there, read_pose, stack_columns
+from ccnn_torch.records.commanded import commanded_poses, is_commanded
+from ccnn_torch.records.headers import columns_there, pose_columns, read_pose, stack_columns
 from ccnn_torch.records.joint_map import JointMap, read_joint_map
 from ccnn_torch.records.load import JOINT_LIMIT
 from ccnn_torch.records.read_table import mapped, read_parts
 from ccnn_torch.records.table import Table, writing_table
 from ccnn_torch.units import from_si, si_unit_of
 
-# Largest pose error of the nominal machine at the joints found [m, rad].
-_CLOSE = 1e-8
-# Initial guesses solved at once where that of the previous row does not converge.
-_STARTS = 64
 # Joints all over the measured region, among which the first row's guess is looked for.
 _LOOKED_AT = 2000
 _LARGEST = 500_000_000
@@ -40,11 +38,15 @@ ROWS = 1024
 """Rows that a model takes at once: its calls count for nothing then, and it takes a hundred MB."""
 
 
+Array: TypeAlias = NDArray[Any]
+
+
 class WantedPoses:
     """Joints of tables of poses, one after the other; an arm goes on from the last row of the table before.
 
     Attributes:
         chooses: whether joints were found without a given branch, where there are several.
+        goals: whether poses are as the controller has them, `goal_x` …, not as they are measured.
     """
 
     def __init__(
@@ -53,6 +55,7 @@ class WantedPoses:
         allow_code: bool = False,
         tool: Sequence[float] | None = None,
         base: Sequence[float] | None = None,
+        goals: bool = False,
     ) -> None:
         """Take the mechanism that the model was made for.
 
@@ -81,7 +84,9 @@ class WantedPoses:
             self._behind_pose = torch.linalg.inv(_frame(tool)) @ _frame(_measured_tool(loaded, self._mechanism))
         self._first, self._region = torch.from_numpy(loaded.middle), torch.from_numpy(loaded.region)
         self._before: Tensor | None = None
-        self.chooses = False
+        self.chooses, self.goals = False, goals
+        self._form: str | None = None
+        self._of_pose: dict[str, str] = {}
 
     @property
     def sentence(self) -> str:
@@ -100,12 +105,20 @@ class WantedPoses:
         Raises:
             InputError: a column is missing, or poses cannot be reached (named by line).
         """
-        mechanism = self._mechanism
-        values, coordinates, _, read = read_pose(table, mechanism)
-        if len(coordinates) != len(mechanism.pose):
-            missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
-            raise InputError(f"{table.path}: the poses of {mechanism.name} need the columns {', '.join(missing)}, too")
-        poses = self._of_the_measured_tool(torch.from_numpy(values))
+        mechanism, within = self._mechanism, ROUNDED if self.goals else EXACT
+        if self.goals:
+            values, self._form, read = commanded_poses(table, mechanism)
+            mechanism = mechanism.controlled()
+            poses = torch.from_numpy(values)
+        else:
+            values, coordinates, self._form, read = read_pose(table, mechanism)
+            if len(coordinates) != len(mechanism.pose):
+                missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
+                raise InputError(
+                    f"{table.path}: the poses of {mechanism.name} need the columns {', '.join(missing)}, too"
+                )
+            poses = self._of_the_measured_tool(torch.from_numpy(values))
+        self._of_pose = _units(table, read)
         guess = self._first
         guesses = tuple(Coordinate(f"guess_{c.name}", c.unit) for c in mechanism.joints)
         guided = any(c.name in table for c in guesses)
@@ -115,24 +128,43 @@ class WantedPoses:
         self.chooses = bool(mechanism.orientations) and not guided
         if self.chooses:
             before = _nearest(mechanism, self._region, poses[0]) if self._before is None else self._before
-            joints = _follow(mechanism, poses, before)
+            joints = follow(mechanism, poses, before, within)
             self._before = joints[-1]
         else:
             joints = mechanism.solve_inverse(poses, guess=guess)
         # Of all full turns of a revolute joint the one nearest to the guess, or to the first one.
         turning = torch.tensor([c.unit == "rad" for c in mechanism.joints])
         joints = joints - torch.where(turning, 2 * torch.pi * torch.round((joints - guess) / (2 * torch.pi)), 0.0)
-        lost = np.flatnonzero(~_reached(mechanism, joints, poses).numpy())
+        lost = np.flatnonzero(~arrives(mechanism, joints, poses, within).numpy())
         if len(lost):
             raise InputError(
                 f"{table.path}: no joints of {mechanism.name} were found for the pose at {table.name_rows(lost)}; "
                 f"correct or remove it, or give guess_q1[{mechanism.joints[0].unit}]… near the solution"
             )
-        units = {g.name: table.units[g.name] for g in guesses} if guided else _units(table, read)
+        units = {g.name: table.units[g.name] for g in guesses} if guided else self._of_pose
         keys = [g.name if guided else c.unit for g, c in zip(guesses, mechanism.joints, strict=True)]
         return joints.detach().numpy(), {
             c.name: units.get(key, c.unit) for c, key in zip(mechanism.joints, keys, strict=True)
         }
+
+    def commanded(self, command: Array) -> dict[str, ArrayLike]:
+        """Columns of the poses to command where a controller takes no joints: the nominal ones of the commands.
+
+        In the machine's own base, of an arm at the tool of its file; in the form and units in which poses were wanted.
+        Empty where poses do not determine the joints.
+        """
+        machine = self._mechanism.controlled()
+        if len(machine.joints) > len(machine.pose):
+            return {}
+        pose = machine.forward_kinematics(torch.from_numpy(np.asarray(command))).numpy()
+        units = {c.name: c.unit for c in machine.pose}
+        columns = dict(zip(units, pose.T, strict=True))
+        if machine.orientations:
+            turns = pose_columns(pose, self._form)
+            columns = {name: columns[name] for name in ("x", "y", "z")} | turns
+            units |= dict.fromkeys(turns, "1" if self._form == "quaternion" else "rad")
+        shown = {name: self._of_pose.get(unit, unit) for name, unit in units.items()}
+        return {f"command_{n}[{shown[n]}]": from_si(values, units[n], shown[n]) for n, values in columns.items()}
 
     def _of_the_measured_tool(self, poses: Tensor) -> Tensor:
         """Poses of the tool and in the frame with which the model was made, `s x p`."""
@@ -180,36 +212,6 @@ def _nearest(mechanism: Mechanism, region: Tensor, pose: Tensor) -> Tensor:
     return joints[torch.nan_to_num(error.position + turned, nan=torch.inf).argmin()]
 
 
-def _follow(mechanism: Mechanism, poses: Tensor, guess: Tensor) -> Tensor:
-    """Joints of successive poses, each on the branch of the previous row, the first on that of the guess.
-
-    Where that branch has no solution, take the one nearest to the previous row, out of many initial guesses.
-    """
-    starts = mechanism.sample_joints(_STARTS, torch.Generator().manual_seed(0))
-    rows = []
-    for pose in poses:
-        joints = mechanism.solve_inverse(pose, guess=guess)
-        if not bool(_reached(mechanism, joints, pose)):
-            found = mechanism.solve_inverse(pose.expand(_STARTS, -1), guess=starts)
-            distance = mechanism.wrap(found - guess).norm(dim=-1)
-            good = _reached(mechanism, found, pose.expand(_STARTS, -1))
-            joints = found[torch.where(good, distance, torch.inf).argmin()]
-        rows.append(joints)
-        guess = torch.where(_reached(mechanism, joints, pose), joints, guess)
-    return torch.stack(rows)
-
-
-def _reached(mechanism: Mechanism, joints: Tensor, poses: Tensor) -> Tensor:
-    """Whether joints bring the nominal machine to the poses, `...`; an arm's solver stops at the nearest one."""
-    error = mechanism.pose_error(mechanism.forward_kinematics(joints, guess=poses), poses)
-    # A comparison with NaN is false, so a pose without joints is not reached either.
-    reached = error.position < _CLOSE
-    return reached if error.rotation is None else reached & (error.rotation < _CLOSE)
-
-
-Array: TypeAlias = NDArray[Any]
-
-
 @dataclass
 class Compensated:
     """What became of the rows.
@@ -219,6 +221,7 @@ class Compensated:
         outside: how many are outside the domain.
         damped: how many have a damped command.
         fallback: how many violate the limits of the model's card; `first` names the first.
+        branch: how the branch of an arm was chosen, where that was left open.
     """
 
     rows: int = 0
@@ -226,6 +229,7 @@ class Compensated:
     damped: int = 0
     fallback: int = 0
     first: str = ""
+    branch: str = ""
 
 
 def is_of_motion(path: Path) -> bool:
@@ -265,10 +269,8 @@ def compensate_table(
     """
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     poses = WantedPoses(loaded, allow_code, tool, base) if pose else None
-    found = write_compensated(loaded, input, output, poses, back, sd)
+    found = write_compensated(loaded, input, output, poses, back, sd, allow_code=allow_code)
     said = sentences(output, found, loaded)
-    if poses is not None and poses.chooses:
-        said.append(poses.sentence)
     refused = (
         f"{output}: in {found.fallback} of {found.rows} rows, the first from {found.first} of {input}, {model} "
         "violates the limits in its card (finite numbers, |deviation| within the limit); they were written without any "
@@ -285,6 +287,7 @@ def write_compensated(
     back: bool = False,
     sd: bool = False,
     rows: int = ROWS,
+    allow_code: bool = False,
 ) -> Compensated:
     """The table of `compensate_table`, read, computed and written in parts of so many rows."""
     result = Compensated()
@@ -293,6 +296,8 @@ def write_compensated(
         for original in read_parts(input, rows):
             # Headers that the model's run mapped are mapped alike; OUT repeats them as they are.
             table = mapped(original, columns_there(original.units, loaded.columns))
+            if poses is None and not back and is_commanded(table, loaded.joints):
+                poses = WantedPoses(loaded, allow_code, goals=True)
             # A file of poses or commands alone is of the controller as well; one with the mechanism's joints is not.
             own = poses is None and all(c.name in original for c in loaded.joints)
             shown = counted if counted is not None and (counted.is_in(original.names, table) or not own) else None
@@ -307,9 +312,12 @@ def write_compensated(
                     f"--sd: {loaded.path} is identified geometry, which has no standard deviation of a command"
                 )
             added = _added(loaded, found, units, back, sd, shown)
+            added |= {} if poses is None else poses.commanded(found["command"])
             names = {header.partition("[")[0] for header in added}
             write({original.header(n): original.cells(n) for n in original.names if n not in names} | added)
             _count(result, table, found, back)
+    if poses is not None and poses.chooses:
+        result.branch = poses.sentence
     return result
 
 
@@ -389,7 +397,7 @@ def sentences(output: Path, found: Compensated, model: LoadedModel) -> list[str]
             f"{found.damped} of them {_is(found.damped)} near a singular pose or at a limit of the joints "
             f"(status = {DAMPED}), with the nearest safe command."
         )
-    return said
+    return [*said, found.branch] if found.branch else said
 
 
 def _is(count: int) -> str:

@@ -26,6 +26,7 @@ from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.effects.found_machine import found_block
 from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm, as_measured, fit_unknown, judge_frames
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES
@@ -75,7 +76,7 @@ def diagnose(
         said = diagnose_rows(
             situation, records.pose, noise_of(noise, situation), effects, seed, _instrument(records, situation)
         )
-    notes = [*said.notes, *_unread(records, situation, said)]
+    notes = [*records.missing, *said.notes, *_unread(records, situation, said)]
     said = replace(said, lines=tuple(records.lines.tolist())).with_entries(notes=notes, machine=named_machine(said))
     return with_network(said, seed) if network else said
 
@@ -141,7 +142,9 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
     _refuse_no_sign(records, covariates)
     mechanism, more = simulator_inputs(records, mechanism, covariates)
     covariates |= more
-    guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
+    guess = None
+    if records.pose.shape[-1] == len(mechanism.pose):
+        guess = completed(mechanism, records.joints, records.pose, parameters)
     situation = Situation(mechanism, records.joints, covariates, down, parameters, guess)
     refuse_lost_rows(records, situation)
     return situation

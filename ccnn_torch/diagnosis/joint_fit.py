@@ -21,7 +21,7 @@ from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
 from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.whitening import Whitening, moving_channels, renewed
-from ccnn_torch.effects import Acting, Effect, Situation
+from ccnn_torch.effects import Acting, Effect, Situation, measured_channels
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.evidence.priors import EFFECT
 from ccnn_torch.mechanisms import Mechanism
@@ -163,7 +163,8 @@ class _Model:
         fine = usable & torch.isfinite(left).all(-1) & torch.isfinite(every).flatten(1).all(-1)
         left = torch.where(fine[:, None], left, 0.0)
         every = torch.where(fine[:, None, None], every, 0.0)
-        return _Rows(self, there, fine, every, left, left + every @ at)
+        seen = measured_channels(self.situation, measured)
+        return _Rows(self, there, fine, every, left, left + every @ at, seen)
 
     def columns(self, there: Situation, known: Known) -> Tensor:
         """Of one effect, `s x c x m`; 0 for coefficients that are not used."""
@@ -196,6 +197,7 @@ class _Rows:
         columns: change of the pose by each coefficient in plausible sizes, `s x c x P` [m, rad].
         left: what the machine leaves, `s x c` [m, rad].
         target: what the linear model has to explain, `s x c` [m, rad].
+        seen: which values were measured, `s x c` bool; None = all.
     """
 
     model: _Model
@@ -204,6 +206,7 @@ class _Rows:
     columns: Tensor
     left: Tensor
     target: Tensor
+    seen: Tensor | None
 
     @property
     def grouped(self) -> dict[tuple[str, str], Tensor]:
@@ -222,17 +225,21 @@ class _Rows:
     def whitening(self) -> Whitening:
         """Noise from the richest fit; rows that only all effects together explain count as yet."""
         channels = moving_channels(self.model.situation)
-        white = fitted_whitening(self.target, [self.columns[..., g] for g in self.groups], channels, None, self.fine)
+        white = fitted_whitening(
+            self.target, [self.columns[..., g] for g in self.groups], channels, None, self.fine, self.seen
+        )
         left = self.left[:, channels] / white.sigma
         near = inlying(left.norm(dim=-1), self.fine, len(channels), 0)
         return replace(white, weight=(self.fine & near).to(left.dtype))
 
     def grams(self, white: Whitening) -> Grams:
-        return grams_of(white(self.columns), white(self.target))
+        return grams_of(white(self.columns), white(self.target))._replace(
+            values=white.count(torch.arange(len(self.fine)))
+        )
 
     def renewed(self, white: Whitening, fit: Fits, at: Tensor) -> Whitening:
         """Noise and weights from what a fit leaves."""
-        values = max(float(self.fine.sum()) * len(white.channels), 1.0)
+        values = max(white.count(torch.nonzero(self.fine).squeeze(-1)), 1.0)
         free = 1 - float(fit.effective[0]) / values
         left = (self.target - self.columns @ at)[:, white.channels]
         return renewed(white, left, self.target[:, white.channels], free, self.fine)

@@ -6,7 +6,9 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ccnn_torch.effects.apply import (
         Acting as Acting,
+        filled as filled,
         labelled as labelled,
+        measured_channels as measured_channels,
         measured_pose as measured_pose,
         moved_joints as moved_joints,
         pose_residual as pose_residual,

@@ -151,15 +151,35 @@ def measured_pose(situation: Situation, frame: Tensor) -> Tensor:
     return pose
 
 
+def measured_channels(situation: Situation, measured: Tensor) -> Tensor | None:
+    """Channels of position and rotation vector that a measured pose shows, `s x c` bool; None where it shows all.
+
+    measured: `s x p` [SI]; NaN where not measured.
+    """
+    if not bool(measured.isnan().any()):
+        return None
+    return ~((situation.frame_slope != 0) & measured.isnan()[:, None, :]).any(-1)
+
+
+def filled(situation: Situation, measured: Tensor) -> Tensor:
+    """Poses with the nominal ones in what was not measured; rows of which nothing was stay NaN."""
+    lacking = measured.isnan()
+    return (
+        torch.where(lacking & ~lacking.all(-1, keepdim=True), situation.pose, measured) if lacking.any() else measured
+    )
+
+
 def pose_residual(situation: Situation, measured: Tensor) -> Tensor:
     """Measured less nominal pose: position [m], and the rotation vector between them in the base frame [rad].
 
     Args:
-        measured: `... x s x p` [SI].
+        measured: `... x s x p` [SI]; NaN where not measured.
 
     Returns:
-        `... x s x c`, c = 3 without orientation, else 6; channels that the mechanism cannot move are 0 in both.
+        `... x s x c`, c = 3 without orientation, else 6; 0 in channels that the mechanism cannot
+        move and in what was not measured.
     """
+    measured = filled(situation, measured)
     there, nominal = situation.mechanism.frame(measured), situation.mechanism.frame(situation.pose)
     position = there[0] - nominal[0]
     if there[1] is None or nominal[1] is None:

@@ -22,7 +22,12 @@ _ALIKE = 2
 
 
 def search(
-    atoms: Sequence[Candidate], x: Sequence[Tensor], y: Tensor, noise_dof: float, quick: bool = False
+    atoms: Sequence[Candidate],
+    x: Sequence[Tensor],
+    y: Tensor,
+    noise_dof: float,
+    quick: bool = False,
+    values: float | None = None,
 ) -> tuple[Dictionary, list[FittedSet]]:
     """Sets by log posterior, best first; no set holds a name twice, or two discrepancy terms.
 
@@ -32,8 +37,9 @@ def search(
         y: what they explain, whitened, `s x c`.
         noise_dof: as for `fit_sets`.
         quick: whether to look at pairs with the likeliest atoms only, for a start.
+        values: how many values are explained, where some of y were not measured and are 0; all when None.
     """
-    alone = singles_of(atoms, x, y, noise_dof)
+    alone = singles_of(atoms, x, y, noise_dof, values)
     ranked = _ranked(alone.found)
     known = [i for i in ranked if not atoms[i].is_discrepancy]
     others = _of_several_drivers([i for i in ranked if atoms[i].is_discrepancy], atoms)

@@ -132,14 +132,17 @@ def covariance(dictionary: Dictionary, found: FittedSet) -> Tensor:
 
 
 class Singles(NamedTuple):
-    """Fits of no atom, and of each alone; the principal axes of each; and the inner products of its columns."""
+    """Fits of no atom, and of each alone; principal axes and inner products of each; how many values there are."""
 
     found: dict[tuple[int, ...], FittedSet]
     axes: list[Tensor]
     products: list[GroupProducts]
+    values: float
 
 
-def singles_of(atoms: Sequence[Candidate], x: Sequence[Tensor], y: Tensor, noise_dof: float) -> Singles:
+def singles_of(
+    atoms: Sequence[Candidate], x: Sequence[Tensor], y: Tensor, noise_dof: float, values: float | None = None
+) -> Singles:
     """Fit no atom, and each alone.
 
     Args:
@@ -147,10 +150,12 @@ def singles_of(atoms: Sequence[Candidate], x: Sequence[Tensor], y: Tensor, noise
         x: whitened columns of each, `s x c x m`.
         y: what they explain, whitened, `s x c`.
         noise_dof: weight of the prior of the noise, in values; 0 = it is not known.
+        values: how many of y were measured, the others being 0; all when None.
     """
+    values = float(y.numel()) if values is None else values
     products = [own_products(columns, y) for columns in x]
-    found, axes = _alone(dict(enumerate(products)), atoms, y.square().sum(), float(y.numel()), noise_dof)
-    return Singles(found, [*axes.values()], products)
+    found, axes = _alone(dict(enumerate(products)), atoms, y.square().sum(), values, noise_dof)
+    return Singles(found, [*axes.values()], products, values)
 
 
 def _alone(
@@ -285,7 +290,7 @@ def _grams(
     for i, group in groups.items():
         xx[_run(group), _run(group)] = singles.products[i].xx
     xy = torch.cat([y.reshape(-1)[:0], *(singles.products[i].xy for kind in kinds for i in kind)])
-    return Grams(xx, xy, y.square().sum(), float(y.numel()))
+    return Grams(xx, xy, y.square().sum(), singles.values)
 
 
 def _run(group: Tensor) -> slice:

@@ -43,7 +43,7 @@ from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
 from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, PoseError, SerialArm, fit_unknown
 from ccnn_torch.mechanisms.frames.instrument import instrument
 from ccnn_torch.mechanisms.frames.readings import READINGS
-from ccnn_torch.records.joint_map import read_joint_map, with_joints
+from ccnn_torch.records.commanded import read_joints
 from ccnn_torch.records.load import read_source
 
 # Links and noise are estimated in turn, the noise from this size on [m].
@@ -255,8 +255,8 @@ def _beside(config: IdentifyConfig, mechanism: Mechanism) -> tuple[list[Build], 
             seen = mechanism if about.instrument is None else _held_by(mechanism, about.instrument)
             rows = _placed(poses_of(config, about.records, seen)[0])
         else:
-            counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
-            table = with_joints(read_source(about.records, config.columns), counted)
+            source = read_source(about.records, config.columns)
+            table = read_joints(source, mechanism, config.joint_map, config.columns)
             rows = rows_of(table, mechanism, about, torch.arange(len(table)))
         found.append(_builder(about, mechanism, rows))
         told.append({"rows": len(rows.joints), "unit": "rad" if _angles_alone(rows) else "m"})

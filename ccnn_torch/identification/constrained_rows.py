@@ -17,15 +17,12 @@ from ccnn_torch.identification.config import BesideConfig, ConstraintConfig, Ide
 from ccnn_torch.identification.measured import split_records
 from ccnn_torch.mechanisms import Mechanism, as_measured
 from ccnn_torch.records import Records, Table, load_records, stack_columns
-from ccnn_torch.records.headers import check_joints
-from ccnn_torch.records.joint_map import read_joint_map, with_joints
+from ccnn_torch.records.commanded import SECOND, read_joints
 from ccnn_torch.records.load import read_source
 
 GROUPED_BY = {"sockets": "placement", "distances": "anchor", "plane": "plane"}
 """Column that numbers the groups of each kind, unless the config names others."""
 Kind = ConstraintConfig | BesideConfig
-# What the columns of the second place of a distance end with.
-_SECOND = "_b"
 # Joints beyond this are taken for degrees [rad], as in records of poses: 4 turns.
 _ANGLE_LIMIT = 8 * np.pi
 
@@ -80,8 +77,7 @@ def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given |
         return replace(rows, weights=weights)
     if isinstance(source, Records):
         raise InputError("records: a constraint has columns of its own; give the path of its file, or a DataFrame")
-    counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
-    table = with_joints(read_source(source, config.columns), counted)
+    table = read_joints(read_source(source, config.columns), mechanism, config.joint_map, config.columns)
     there = _taking_part(table, about.where)
     rows = rows_of(table, mechanism, about, there)
     joints = rows.joints
@@ -98,9 +94,8 @@ def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given |
 
 def rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> ConstraintRows:
     """The rows of a table that are numbered, all of weight 1."""
-    check_joints(table, mechanism.joints)
     joints = torch.from_numpy(stack_columns(table, mechanism.joints, _ANGLE_LIMIT))[there]
-    second = [Coordinate(f"{j.name}{_SECOND}", j.unit) for j in mechanism.joints]
+    second = [Coordinate(f"{j.name}{SECOND}", j.unit) for j in mechanism.joints]
     paired = about.kind == "distances" and any(c.name in table for c in second)
     others = torch.from_numpy(stack_columns(table, second, _ANGLE_LIMIT))[there] if paired else None
     if paired and about.by is not None:

@@ -278,6 +278,7 @@ def bootstrap(problem: Problem, fit: Fit, solver: Solver, count: int = 200, seed
         problem,
         start=start.repeat(count, 1),
         weights=problem.weights.repeat(count, 1),
+        missing=None if problem.missing is None else repeated(problem.missing),
         data=(*(repeated(d) for d in problem.data), _redrawn(problem, fit.values, uniform)),
         residual=lambda values, *rows: problem.residual(values, *rows[:-1]) + rows[-1],
     )
@@ -293,8 +294,9 @@ def _redrawn(problem: Problem, values: Tensor, uniform: Tensor) -> Tensor:
     left = values.new_zeros(*problem.weights.shape, len(problem.channels))
     left[:, kept] = rows.residuals(values[:, None], everyone)[:, 0]
     root = problem.weights.sqrt()[..., None]
-    equations = (problem.weights > 0).sum(-1) * len(problem.channels)
-    raised = (equations / (equations - values.shape[-1]).clamp_min(1)).sqrt()[:, None, None]
+    # What was not measured is 0 among the residuals that are drawn.
+    drawn_from = (problem.weights > 0).sum(-1) * len(problem.channels)
+    raised = (drawn_from / (problem.equations - values.shape[-1]).clamp_min(1)).sqrt()[:, None, None]
     pool = left * root
     pool = (pool - pool.sum(-2, keepdim=True) / (root > 0).sum(-2, keepdim=True)) * raised
     # The n-th used row of a machine, n drawn uniformly.

@@ -17,6 +17,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.measured import Measured, Rows, read_records, rows_of_split, split_records
 from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, fit_frames
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.least_squares import jacobian_of
 
 _LOW, _HIGH = 0.05, 0.95
@@ -59,7 +60,7 @@ def before_and_after(
     """Position and rotation: RMS and maximum over the poses of a machine, before and after.
 
     Args:
-        before, after: `r x t`.
+        before, after: `r x t`; NaN where nothing of the kind was measured.
         noise: of the measurement, `r x t`, where it is known.
         removed: whether the share of the RMS that was removed is of interest.
     """
@@ -73,8 +74,8 @@ def before_and_after(
         entries: dict[str, Tensor | None] = {
             "before": _rms(first),
             "after": _rms(last),
-            "max_before": first.amax(-1),
-            "max_after": last.amax(-1),
+            "max_before": first.nan_to_num().amax(-1),
+            "max_after": last.nan_to_num().amax(-1),
         }
         if floor is not None:
             entries["noise"] = _rms(floor)
@@ -86,7 +87,7 @@ def before_and_after(
 
 def _rms(values: Tensor) -> Tensor:
     """`r x t` -> `r`."""
-    return values.square().mean(-1).sqrt()
+    return values.square().nanmean(-1).sqrt()
 
 
 class Commanded(NamedTuple):
@@ -105,7 +106,8 @@ def predicted(measured: Measured, values: Tensor, machines: Tensor) -> PoseError
         machines: which machines the rows are of, `r`.
     """
     rows = measured.test.of(machines)
-    pose = measured.kinematics.reached(rows.joints, values[:, None], rows.observed)
+    guess = completed(measured.mechanism, rows.joints, rows.observed, values[:, None])
+    pose = measured.kinematics.reached(rows.joints, values[:, None], guess)
     return measured.mechanism.pose_error(pose, rows.observed)
 
 

@@ -21,6 +21,7 @@ from ccnn_torch.mechanisms import (
     judge_frames,
     load_mechanism,
 )
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Split
 
@@ -83,7 +84,8 @@ class Rows:
 
     Attributes:
         joints: as recorded, `r x s x n` [SI].
-        observed: what was measured, `r x s x o` [SI]: pose coordinates of the view, or values of a constraint.
+        observed: what was measured, `r x s x o` [SI]: pose coordinates of the view (NaN: not measured), or values of a
+            constraint.
     """
 
     joints: Tensor
@@ -193,7 +195,7 @@ def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) ->
 
 def _check_joints(records: Records, mechanism: Mechanism) -> None:
     """Refuse rows whose joints the nominal machine cannot take: no residual is known there, and no error before."""
-    reached = mechanism.forward_kinematics(records.joints, guess=records.pose)
+    reached = mechanism.forward_kinematics(records.joints, guess=completed(mechanism, records.joints, records.pose))
     lost = torch.nonzero(~torch.isfinite(reached).all(-1)).squeeze(-1).numpy()
     if len(lost):
         raise InputError(

@@ -104,9 +104,14 @@ def leg_of(part: Problem) -> int:
 def _problem(
     measured: Measured, config: IdentifyConfig, rows: Rows, machines: Tensor, per_leg: bool, near: Tensor | None
 ) -> Problem:
-    forward = config.residual == "forward" or (
-        config.residual == "auto" and (compares_poses(measured.mechanism) or config.frame.base or config.frame.tool)
-    )
+    gaps = bool(rows.observed.isnan().any())
+    if gaps and config.residual == "inverse":
+        raise InputError(
+            "residual: inverse compares joints, which only a whole pose has, and some rows lack a part of it; write "
+            "residual=auto, or leave these rows out"
+        )
+    about = gaps or compares_poses(measured.mechanism) or config.frame.base or config.frame.tool
+    forward = config.residual == "forward" or (config.residual == "auto" and about)
     if forward and per_leg:
         raise InputError(
             "methods: a pose depends on all legs, so legs are identified apart only by their joints; write "
@@ -146,7 +151,10 @@ def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
     if not (config.frame.base or config.frame.tool):
         return measured
     assert isinstance(measured.mechanism, Framed)
-    closed = measured.mechanism.fitted_frames(measured.rows.joints, measured.view.frame(measured.rows.observed))
+    observed = measured.rows.observed
+    whole = (~observed.isnan().any(-1)).to(observed.dtype)
+    frame = measured.view.frame(observed.nan_to_num())
+    closed = measured.mechanism.fitted_frames(measured.rows.joints, frame, whole)
     prefixes = tuple(f"{part}_" for part, free in (("base", config.frame.base), ("tool", config.frame.tool)) if free)
     names = [p.name for p in measured.mechanism.geometry if p.name.startswith(prefixes)]
     choice = ParameterChoice(free=names)

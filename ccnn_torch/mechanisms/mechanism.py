@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import newton as _numeric
+from ccnn_torch.mechanisms import branches as _branches, newton as _numeric
 from ccnn_torch.mechanisms.pose import (
     PoseError,
     coordinates_jacobian,
@@ -186,6 +186,21 @@ class Mechanism(nn.Module):
             closest=len(self.joints) > len(self.pose),
         )
 
+    def controlled(self) -> Mechanism:
+        """The nominal machine as its controller has it: in its own base, at the tool that it was given."""
+        return self
+
+    def commanded_joints(self, pose: Tensor, guess: Tensor | None = None) -> Tensor:
+        """Joints for poses in the order commanded, `s x n` [SI]; NaN out of reach, rounding of the poses aside.
+
+        Where there are several, those nearest to the previous row's, in the first row to `home_joints`.
+
+        Args:
+            pose: `s x p` [SI].
+            guess: `s x n` [SI], joints on the branch to take.
+        """
+        return _branches.commanded_joints(self, pose, guess)
+
     def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
         """Its legs or links at one configuration as lines by name, `k x 3` [m] in the robot's frame; default: none.
 
@@ -265,8 +280,24 @@ class Mechanism(nn.Module):
         return self.solve_inverse(pose, parameters, guess)
 
     def pose_error(self, measured: Tensor, reference: Tensor) -> PoseError:
-        """Distance [m] and geodesic angle [rad] between two poses, `... x p` each."""
-        return pose_error(self.frame(measured), self.frame(reference))
+        """Distance [m] and geodesic angle [rad] between two poses, `... x p` each.
+
+        What one of them lacks (NaN) does not count; where it lacks all lengths or all angles, that error is NaN.
+        """
+        lacking = measured.isnan() | reference.isnan()
+        if not bool(lacking.any()):
+            return pose_error(self.frame(measured), self.frame(reference))
+        whole = torch.where(measured.isnan(), reference, measured), torch.where(reference.isnan(), measured, reference)
+        found = pose_error(*(self.frame(pose) for pose in whole))
+        position, rotation = (
+            error if error is None or not kind else torch.where(lacking[..., kind].all(-1), torch.nan, error)
+            for error, kind in (
+                (error, [k for k, c in enumerate(self.pose) if c.unit == unit])
+                for error, unit in zip(found, ("m", "rad"), strict=True)
+            )
+        )
+        assert position is not None
+        return PoseError(position, rotation)
 
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Derivative of position and (with orientation) rotation vector in the base frame; joints `... x n`.

@@ -203,11 +203,16 @@ class HasCoordinates(Protocol):
     def orientations(self) -> tuple[str, ...]: ...
 
 
-def stack_columns(table: Table, coordinates: Sequence[Coordinate], angle_limit: float = np.inf) -> NDArray[np.float64]:
-    """Columns side by side, `rows x len(coordinates)`; refuses angles in rad beyond `angle_limit`."""
+def stack_columns(
+    table: Table, coordinates: Sequence[Coordinate], angle_limit: float = np.inf, gaps: bool = False
+) -> NDArray[np.float64]:
+    """Columns side by side, `rows x len(coordinates)`; refuses angles in rad beyond `angle_limit`.
+
+    With `gaps` cells may be empty, and NaN stands for them.
+    """
     values = np.empty((len(table), len(coordinates)))
     for k, coordinate in enumerate(coordinates):
-        values[:, k] = table.column(coordinate.name, coordinate.unit)
+        values[:, k] = table.column(coordinate.name, coordinate.unit, gaps)
         far = np.flatnonzero(np.abs(values[:, k]) > angle_limit)
         if table.units[coordinate.name] == "rad" and len(far):
             raise InputError(
@@ -218,48 +223,95 @@ def stack_columns(table: Table, coordinates: Sequence[Coordinate], angle_limit: 
 
 
 def read_pose(
-    table: Table, mechanism: HasCoordinates, partial: bool = False
+    table: Table, mechanism: HasCoordinates, partial: bool = False, named: str = "{}"
 ) -> tuple[NDArray[np.float64], tuple[Coordinate, ...], str | None, tuple[str, ...]]:
     """Pose `rows x p` [SI], its coordinates, how the orientation was measured, and the columns that were read.
 
     A rotation vector counts before a quaternion, and that before Euler angles, where a file has several.
 
     Args:
-        partial: whether some of the pose coordinates are enough.
+        partial: whether some of the pose coordinates are enough: columns may be missing or empty, and so may cells, for
+            which NaN stands; of an orientation all three are NaN then.
+        named: what the columns are called, with the coordinate's name in the place of the braces.
 
     Raises:
         InputError: a column is missing or cannot be used, or a quaternion has not the norm 1.
     """
+
+    def stacked(coordinates: Sequence[Coordinate], limit: float = np.inf) -> NDArray[np.float64]:
+        return stack_columns(table, [Coordinate(named.format(c.name), c.unit) for c in coordinates], limit, partial)
+
+    if partial:
+        table = _without_empty(table, mechanism)
     if not mechanism.orientations:
         pose = _measured(table, mechanism.pose, mechanism) if partial else mechanism.pose
         pose = tuple(pose or mechanism.pose)
-        return stack_columns(table, pose, _POSE_LIMIT), pose, None, tuple(c.name for c in pose)
+        return _together(stacked(pose, _POSE_LIMIT), pose), pose, None, tuple(named.format(c.name) for c in pose)
     position = tuple(c for c in mechanism.pose if c.name not in _ROTATION_VECTOR)
     turns = tuple(Coordinate(name, "rad") for name in _ROTATION_VECTOR)
     forms = {"rotation_vector": _ROTATION_VECTOR, "quaternion": _QUATERNION}
     forms |= {name: columns for name, (columns, _) in EULER_ANGLES.items()}
-    form = next((name for name, columns in forms.items() if any(column in table for column in columns)), "none")
-    read = (*(c.name for c in position), *forms.get(form, ()))
+    form = next((name for name, columns in forms.items() if any(named.format(c) in table for c in columns)), "none")
     if partial:
         there = _measured(table, position, mechanism)
         position = position if form == "none" and not there else there
-        read = (*(c.name for c in position), *forms.get(form, ()))
+    read = tuple(named.format(name) for name in (*(c.name for c in position), *forms.get(form, ())))
     full = (*position, *turns)
     if form == "rotation_vector":
-        return stack_columns(table, full, _POSE_LIMIT), full, form, read
-    where = stack_columns(table, position)
+        return _together(stacked(full, _POSE_LIMIT), full), full, form, read
+    where = stacked(position)
     if form == "none":
         return where, position, form, read
     # Imported here: few files need it, and the import takes long.
     from scipy.spatial.transform import Rotation
 
+    vector = np.full((len(table), 3), np.nan)
     if form == "quaternion":
-        turn = Rotation.from_quat(_quaternions(table)[:, [1, 2, 3, 0]])
+        values = _quaternions(table, read[-4:], partial)[:, [1, 2, 3, 0]]
+        known = np.isfinite(values).all(1)
+        turn = Rotation.from_quat(values[known])
     else:
         columns, axes = EULER_ANGLES[form]
-        angles = stack_columns(table, [Coordinate(name, "rad") for name in columns], _POSE_LIMIT)
-        turn = Rotation.from_euler(axes, angles)
-    return np.concatenate([where, turn.as_rotvec()], axis=1), full, form, read
+        values = stacked([Coordinate(name, "rad") for name in columns], _POSE_LIMIT)
+        known = np.isfinite(values).all(1)
+        turn = Rotation.from_euler(axes, values[known])
+    vector[known] = turn.as_rotvec()
+    return np.concatenate([where, vector], axis=1), full, form, read
+
+
+def _without_empty(table: Table, mechanism: HasCoordinates) -> Table:
+    """The table without columns of a pose whose cells are all empty."""
+    names = {c.name for c in mechanism.pose}
+    names |= {*_ROTATION_VECTOR, *_QUATERNION, *(name for columns, _ in EULER_ANGLES.values() for name in columns)}
+    return table.without([name for name in table.names if name in names and table.blank(name).all()])
+
+
+def _together(pose: NDArray[np.float64], coordinates: Sequence[Coordinate]) -> NDArray[np.float64]:
+    """The pose with all of rx, ry, rz NaN where one of them is: a rotation vector means nothing in part."""
+    names = [c.name for c in coordinates]
+    if set(_ROTATION_VECTOR) <= set(names):
+        turns = [names.index(name) for name in _ROTATION_VECTOR]
+        # One NaN makes the sum NaN.
+        pose[:, turns] += 0 * pose[:, turns].sum(1, keepdims=True)
+    return pose
+
+
+def pose_columns(pose: NDArray[np.float64], form: str | None) -> dict[str, NDArray[np.float64]]:
+    """The columns of an orientation that `read_pose` found in this form, `rows` [rad or 1], by name.
+
+    Args:
+        pose: its position and rotation vector, `rows x 6` [SI].
+        form: as `read_pose` gives it; a rotation vector where it had none.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec(pose[:, 3:])
+    if form == "quaternion":
+        return dict(zip(_QUATERNION, turn.as_quat()[:, [3, 0, 1, 2]].T, strict=True))
+    if form in EULER_ANGLES:
+        columns, axes = EULER_ANGLES[form]
+        return dict(zip(columns, turn.as_euler(axes).T, strict=True))
+    return dict(zip(_ROTATION_VECTOR, pose[:, 3:].T, strict=True))
 
 
 def _measured(table: Table, pose: Sequence[Coordinate], mechanism: HasCoordinates) -> tuple[Coordinate, ...]:
@@ -270,12 +322,16 @@ def _measured(table: Table, pose: Sequence[Coordinate], mechanism: HasCoordinate
     return tuple(c for c in pose if meant or c.name in table)
 
 
-def check_joints(table: Table, joints: Sequence[Coordinate]) -> None:
-    """Refuse a table without a joint's column, with the map of columns that look like joints, or with a joint more.
+def check_joints(table: Table, mechanism: HasCoordinates, commanded: bool = False) -> None:
+    """Refuse a table without joints, with the map of columns that look like some, or with a joint more.
+
+    Args:
+        commanded: whether commanded poses take the place of the joints.
 
     Raises:
         InputError: names the joint, and the map to write.
     """
+    joints = mechanism.joints
     more = f"q{len(joints) + 1}"
     if more in table and all(joint.name == f"q{k + 1}" and joint.name in table for k, joint in enumerate(joints)):
         raise InputError(
@@ -293,6 +349,12 @@ def check_joints(table: Table, joints: Sequence[Coordinate]) -> None:
         raise InputError(
             f"{table.path}: there is no column '{missing[0].name}'; these look like joints: {_quoted(pairs)}; write "
             f"columns: {{{', '.join(entries)}}} if they are meant, or rename them"
+        )
+    if len(missing) == len(joints) > 1 and not commanded:
+        goals = ", ".join(f"goal_{c.header}" for c in mechanism.pose)
+        raise InputError(
+            f"{table.path}: there is no column '{joints[0].name}'; give the joints ({joints[0].header} …), or the "
+            f"commanded pose as {goals}"
         )
 
 
@@ -329,14 +391,14 @@ def unused_joints(table: Table, joints: Sequence[Coordinate], unused: Iterable[s
     return [name for name in unused if name in alike]
 
 
-def _quaternions(table: Table) -> NDArray[np.float64]:
-    quaternion = stack_columns(table, [Coordinate(name, "1") for name in _QUATERNION])
+def _quaternions(table: Table, names: Sequence[str], gaps: bool) -> NDArray[np.float64]:
+    quaternion = stack_columns(table, [Coordinate(name, "1") for name in names], gaps=gaps)
     norm = np.linalg.norm(quaternion, axis=1)
     # Written with three digits a unit quaternion is within 0.001 of norm 1; ten times that is no quaternion.
     wrong = np.flatnonzero(np.abs(norm - 1) > 0.01)
     if len(wrong):
         raise InputError(
-            f"{table.path}: the quaternion qw, qx, qy, qz at {table.name_rows(wrong)} has norm "
+            f"{table.path}: the quaternion {', '.join(names)} at {table.name_rows(wrong)} has norm "
             f"{norm[wrong[0]]:.3g} instead of 1; correct it, or give the orientation as rx[rad], ry[rad], rz[rad]"
         )
     return quaternion

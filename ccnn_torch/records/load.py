@@ -14,16 +14,15 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
+from ccnn_torch.records.commanded import Moving, read_joints
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES, choose_covariates
 from ccnn_torch.records.headers import (
     HasCoordinates,
-    check_joints,
     check_orientation,
     read_pose as read_pose,
     stack_columns as stack_columns,
     unused_joints,
 )
-from ccnn_torch.records.joint_map import read_joint_map, with_joints
 from ccnn_torch.records.read_table import Frame, read_frame, read_table
 from ccnn_torch.records.table import FILE as FILE, Table, name_lines as name_lines, write_table as write_table
 from ccnn_torch.units import to_si
@@ -120,7 +119,7 @@ class Records:
     Attributes:
         path: the file; several with commas between them.
         joints: commanded joints, `rows x n`.
-        pose: measured pose, `rows x p`, the columns as in `pose_coordinates`.
+        pose: measured pose, `rows x p`, the columns as in `pose_coordinates`; NaN where a cell is empty.
         covariates: further inputs, `rows x m`, the columns as in `covariate_coordinates`.
         joint_coordinates, pose_coordinates, covariate_coordinates: names and SI units. The pose is the mechanism's,
             less the orientation where it was not measured.
@@ -154,8 +153,27 @@ class Records:
 
     @property
     def positions(self) -> Tensor:
-        """The pose coordinates that are lengths, `rows x d` [m]."""
-        return self.pose[:, [k for k, coordinate in enumerate(self.pose_coordinates) if coordinate.unit == "m"]]
+        """The pose coordinates that are lengths, `rows x d` [m]; the mean where one was not measured."""
+        found = self.pose[:, [k for k, coordinate in enumerate(self.pose_coordinates) if coordinate.unit == "m"]]
+        return torch.where(found.isnan(), found.nanmean(0), found)
+
+    @property
+    def whole(self) -> Tensor:
+        """Rows whose pose was measured in all its coordinates, `rows`, bool."""
+        return ~self.pose.isnan().any(-1)
+
+    @property
+    def missing(self) -> list[str]:
+        """Sentences on coordinates of the pose that were not measured in some rows."""
+        counts: dict[int, list[str]] = {}
+        for count, coordinate in zip(self.pose.isnan().sum(0).tolist(), self.pose_coordinates, strict=True):
+            counts.setdefault(count, []).append(coordinate.name)
+        return [
+            f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} missing in {count} of {len(self)} rows, which "
+            "count with what was measured"
+            for count, names in counts.items()
+            if count
+        ]
 
     def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
         """Rows (0-based) by their lines in the file, e.g. "line 17 (row 16)"."""
@@ -164,7 +182,7 @@ class Records:
 
 def load_records(
     source: Source | Records,
-    mechanism: HasCoordinates,
+    mechanism: Moving,
     covariates: Sequence[str] | None = None,
     learns: bool = True,
     columns: Mapping[str, str] | None = None,
@@ -172,9 +190,11 @@ def load_records(
 ) -> Records:
     """Load records for a mechanism.
 
-    Joint and pose columns are named as the mechanism names them. A serial arm (one that lists `orientations`) may have
-    its orientation as a rotation vector `rx, ry, rz`, as a quaternion `qw, qx, qy, qz`, as Euler angles
-    (`kuka_a, kuka_b, kuka_c`, `fanuc_w, fanuc_p, fanuc_r`, `staubli_rx, staubli_ry, staubli_rz`) or not at all; where a
+    Joint and pose columns are named as the mechanism names them. Where there are no joints, they are the nominal
+    inverse kinematics of the poses that were commanded, `goal_x`, `goal_y` … (`commanded.read_joints`). A serial arm
+    (one that lists `orientations`) may have its orientation as a rotation vector `rx, ry, rz`, as a quaternion
+    `qw, qx, qy, qz`, as Euler angles (`kuka_a, kuka_b, kuka_c`, `fanuc_w, fanuc_p, fanuc_r`,
+    `staubli_rx, staubli_ry, staubli_rz`) or not at all; where a
     file has several, the first of these counts. The covariates are by default the columns `time`, `temperature`,
     `load_*`, `direction*` and `speed*` that are there; `covariates` replaces this choice by names or patterns
     ([] = none). A constant covariate is dropped with a note. A column that is not used needs no unit.
@@ -195,10 +215,10 @@ def load_records(
     """
     if isinstance(source, Records):
         return _loaded(source, mechanism, covariates, columns or joint_map)
-    table = with_joints(read_source(source, columns), read_joint_map(joint_map or {}, mechanism.joints, columns))
-    check_joints(table, mechanism.joints)
+    table = read_joints(read_source(source, columns), mechanism, joint_map, columns)
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
     pose, coordinates, orientation, read = read_pose(table, mechanism, partial=True)
+    _refuse_empty(table, pose, coordinates)
     used = {joint.name for joint in mechanism.joints} | set(read)
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
@@ -228,7 +248,7 @@ def load_records(
         notes.append(
             f"columns {', '.join(alike)} look like joints and are not used; {mechanism.name} has no such joint"
         )
-    return Records(
+    records = Records(
         path=table.path,
         joints=torch.from_numpy(joints),
         pose=torch.from_numpy(pose),
@@ -244,6 +264,7 @@ def load_records(
         data_hash=table.data_hash,
         parts=table.parts,
     )
+    return replace(records, notes=[*records.missing, *notes])
 
 
 def check_rows(records: Records, mechanism: HasCoordinates) -> None:
@@ -261,7 +282,7 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
         reachable = getattr(mechanism, "reachable", None)
         if reachable is None or len(records.pose_coordinates) != len(mechanism.pose):
             return
-        outside = np.flatnonzero(~reachable(records.pose).numpy())
+        outside = np.flatnonzero((records.whole & ~reachable(records.pose)).numpy())
         if len(outside):
             raise InputError(
                 f"{records.path}: the pose at {records.name_rows(outside)} is outside the workspace of "
@@ -281,6 +302,17 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
             f"{records.path}: the position at {records.name_rows(outside)} is {far}, farther than {mechanism.name} can "
             f"move ({limit:.3g} m, twice its reach and tool); "
             f"correct or remove {'it' if len(outside) == 1 else 'them'}, or check the units"
+        )
+
+
+def _refuse_empty(table: Table, pose: NDArray[np.float64], coordinates: Sequence[Coordinate]) -> None:
+    """Raise `InputError` where a row has nothing of the pose."""
+    empty = np.flatnonzero(np.isnan(pose).all(1))
+    if len(empty):
+        shown = ", ".join(c.name for c in coordinates)
+        raise InputError(
+            f"{table.path}: nothing of the pose was measured at {table.name_rows(empty)}; remove "
+            f"{'it' if len(empty) == 1 else 'them'}, or write what was measured of {shown}"
         )
 
 

@@ -214,6 +214,8 @@ def read_frame(frame: Frame, columns: Mapping[str, str] | None = None) -> Table:
         raise InputError(f"{file}: it has columns but no row")
     lines = np.arange(len(rows), dtype=np.int64) + 2
     values, bad = _read_cells(rows.tolist(), header, file, lines)
+    # A DataFrame has no other empty cell.
+    bad |= {(row, column): "" for row, column in np.argwhere(np.isnan(values)).tolist() if (row, column) not in bad}
     return _kept(file, header, values, lines, bad)
 
 

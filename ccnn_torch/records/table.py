@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +64,14 @@ class Table:
         digest.update(self.values.astype("<f8").tobytes())
         return digest.hexdigest()
 
+    def without(self, names: Sequence[str]) -> Table:
+        """The table without some columns."""
+        kept = [k for k, name in enumerate(self.names) if name not in names]
+        place = {k: i for i, k in enumerate(kept)}
+        bad = {(row, place[column]): text for (row, column), text in self.bad_cells.items() if column in place}
+        units = {name: unit for name, unit in self.units.items() if name not in names}
+        return replace(self, units=units, values=self.values[:, kept], bad_cells=bad) if names else self
+
     def header(self, name: str) -> str:
         """The column's header, ``name[unit]``; the bare name where it has no unit."""
         return f"{name}[{self.units[name]}]" if self.units[name] else name
@@ -89,12 +97,19 @@ class Table:
         unit = self.units[name]
         return f"{self.raw(name)[row]:g}{'' if unit == '1' else ' ' + unit}"
 
-    def column(self, name: str, si_unit: str | None = None) -> NDArray[np.float64]:
+    def blank(self, name: str) -> NDArray[np.bool_]:
+        """Rows in which a column's cell is empty, `rows`."""
+        number = self.names.index(name)
+        rows = [row for (row, column), text in self.bad_cells.items() if column == number and not text]
+        return np.isin(np.arange(len(self)), rows)
+
+    def column(self, name: str, si_unit: str | None = None, gaps: bool = False) -> NDArray[np.float64]:
         """A column in SI, `rows`, every value finite.
 
         Args:
             name: the column.
             si_unit: the SI unit it must be in, or None for any; without a unit it is then as written.
+            gaps: whether cells may be empty; NaN stands for them.
 
         Raises:
             InputError: the column is missing (with the nearest name), has no, a wrong or an unknown unit, or a cell
@@ -106,7 +121,7 @@ class Table:
         if not unit and si_unit is not None:
             parse_header(name, self.path, si_unit)
         values = self.raw(name)
-        wrong = np.flatnonzero(~np.isfinite(values))
+        wrong = np.flatnonzero(~np.isfinite(values) & ~(self.blank(name) if gaps else False))
         if len(wrong):
             row = int(wrong[0])
             text = visible(self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}"), 40)

@@ -116,6 +116,7 @@ def verify_model(
         notes=[],
         text="",
     )
+    results.notes += loaded.missing
     if results.outside_domain:
         results.notes.append(
             f"{count_text(results.outside_domain, 'row')} outside the model's domain, where its correction fades: "
@@ -131,11 +132,12 @@ def verify_model(
 
 def _moved(rows: Rows, results: VerifyResults) -> list[str]:
     """A sentence if a moved measuring frame explains at least half of the remaining error."""
-    if results.kept or not Motion.fits(rows.mechanism) or results.configurations < 4:
+    whole = ~rows.pose.isnan().any(-1)
+    if results.kept or not Motion.fits(rows.mechanism) or min(results.configurations, int(whole.sum())) < 4:
         return []
     at = rows.nominal if results.compensated else rows.predicted
     motion = fit_motion(rows.mechanism, at, rows.pose)
-    left = rms_of(rows.mechanism.pose_error(motion.undone(rows.mechanism, rows.pose), at).position)
+    left = rms_of(rows.mechanism.pose_error(rows.undone(motion), at).position)
     if left is None or left > _SUSPECT * results.position.after.rms:
         return []
     return [
@@ -153,15 +155,17 @@ class Verified:
 
 
 def error_of(unit: Length, before: Tensor | None, after: Tensor | None, promise: Promised | None) -> Error | None:
-    """The errors of all rows before and after, `s` [unit]; None where there are none."""
-    if before is None or after is None:
+    """The errors of all rows before and after, `s` [unit]; NaN where not measured. None where there are none."""
+    if before is None or after is None or bool(after.isnan().all()):
         return None
-    first, last = (Size(rms=float(e.square().mean().sqrt()), max=float(e.max())) for e in (before, after))
+    first, last = (
+        Size(rms=float(e.square().nanmean().sqrt()), max=float(e.nan_to_num().max())) for e in (before, after)
+    )
     return Error(unit=unit, before=first, after=last, promised=promise)
 
 
 def rms_of(values: Tensor) -> float | None:
-    return float(values.square().mean().sqrt()) if values.numel() else None
+    return float(values.square().nanmean().sqrt()) if values.numel() else None
 
 
 def figure_arrays(rows: Rows, measured: Tensor, left: Tensor, before: PoseError, after: PoseError) -> RunArrays:
@@ -171,7 +175,7 @@ def figure_arrays(rows: Rows, measured: Tensor, left: Tensor, before: PoseError,
         measured=measured.detach().numpy(),
         predicted=(measured - left).detach().numpy(),
         test=np.ones(len(rows.joints), dtype=np.bool_),
-        place=rows.mechanism.frame(rows.pose)[0].numpy(),
+        place=rows.mechanism.frame(rows.whole)[0].numpy(),
         position_before=before.position.detach().numpy(),
         position_after=after.position.detach().numpy(),
         rotation_before=None if before.rotation is None else before.rotation.detach().numpy(),

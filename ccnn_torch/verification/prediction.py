@@ -24,6 +24,7 @@ from ccnn_torch.mechanisms import (
     mechanism_from_description,
 )
 from ccnn_torch.mechanisms.frames.fit import rigid_body_frame
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.plugins import code_refused
 from ccnn_torch.pseudoerror import joint_deviations
@@ -48,6 +49,15 @@ class Rows:
     inside: Tensor
     nominal: Tensor
     predicted: Tensor
+
+    @property
+    def whole(self) -> Tensor:
+        """The poses, with the predicted ones in what was not measured, `s x p` [SI]."""
+        return torch.where(self.pose.isnan(), self.predicted, self.pose)
+
+    def undone(self, motion: Motion) -> Tensor:
+        """The poses as they would have been measured in the model's frame, `s x p` [SI]; NaN where not measured."""
+        return torch.where(self.pose.isnan(), torch.nan, motion.undone(self.mechanism, self.whole))
 
 
 def nominal_mechanism(
@@ -96,13 +106,14 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
     pose = records.pose[:, [names.index(c.name) for c in machine.pose]]
     found = model(records.joints.numpy(), _covariates(model, records))
     ideal = torch.from_numpy(np.asarray(found["ideal"]))
-    nominal = machine.forward_kinematics(records.joints, guess=pose)
+    guess = completed(machine, records.joints, pose)
+    nominal = machine.forward_kinematics(records.joints, guess=guess)
     if model.machine is not None:
         real = model.machine.identified
         real = machine.around(real) if isinstance(machine, Seen) else as_measured(real, machine.pose)
-        predicted = real.forward_kinematics(records.joints, guess=pose)
+        predicted = real.forward_kinematics(records.joints, guess=guess)
     else:
-        predicted = machine.forward_kinematics(ideal, guess=pose)
+        predicted = machine.forward_kinematics(ideal, guess=guess)
     lost = np.flatnonzero(~(torch.isfinite(nominal) & torch.isfinite(predicted)).all(-1).numpy())
     if len(lost):
         raise InputError(
@@ -137,12 +148,12 @@ def judge(
     """Pose error before and after, `s`; joint deviation before and after, `s x n` [SI]; rows with one, `s`."""
     machine = rows.mechanism
     if compensated:
-        measured = motions[0].undone(machine, rows.pose)
+        measured = rows.undone(motions[0])
         before = machine.pose_error(rows.predicted, rows.nominal)
         after = machine.pose_error(measured, rows.nominal)
         found = joint_deviations(machine, rows.joints, measured, **settings)
         return before, after, rows.deviation, found.deviation, found.usable
-    first, last = (motion.undone(machine, rows.pose) for motion in motions)
+    first, last = (rows.undone(motion) for motion in motions)
     before = machine.pose_error(first, rows.nominal)
     after = machine.pose_error(last, rows.predicted)
     # Beside the frames that the model's deviation was found with, or those that suit the model best.
@@ -154,7 +165,7 @@ def gaps(rows: Rows, compensated: bool, motions: list[Motion]) -> tuple[Tensor, 
     """Measured positions, and from where they should be to where they are before and after, `s x 3` each [m]."""
     machine = rows.mechanism
     nominal, predicted = (machine.frame(pose)[0] for pose in (rows.nominal, rows.predicted))
-    first, last = (machine.frame(motion.undone(machine, rows.pose))[0] for motion in motions)
+    first, last = (machine.frame(rows.undone(motion))[0] for motion in motions)
     before, after = (predicted - nominal, first - nominal) if compensated else (first - nominal, last - predicted)
     return first, before, after
 
@@ -196,7 +207,7 @@ class Motion:
 
 
 def fit_motion(mechanism: Mechanism, expected: Tensor, measured: Tensor) -> Motion:
-    """The motion that takes expected poses nearest to those measured, `s x p` [SI] each.
+    """The motion that takes expected poses nearest to those measured, `s x p` [SI] each; whole ones (no NaN) count.
 
     Raises:
         InputError: the mechanism's poses cannot be moved in space, or the rows are too few.
@@ -207,7 +218,9 @@ def fit_motion(mechanism: Mechanism, expected: Tensor, measured: Tensor) -> Moti
             f"--refit-frames: the pose of {mechanism.name} is {names}, and a frame can be fitted to x, y, z only "
             "(with or without rx, ry, rz); leave the option out"
         )
-    if len(measured) < _NEEDED:
-        raise InputError(f"--refit-frames: {len(measured)} rows are too few to fit a frame; give {_NEEDED} or more")
+    whole = ~measured.isnan().any(-1)
+    if int(whole.sum()) < _NEEDED:
+        raise InputError(f"--refit-frames: {int(whole.sum())} rows are too few to fit a frame; give {_NEEDED} or more")
+    expected, measured = expected[whole], measured[whole]
     weights = torch.ones(len(measured), dtype=torch.float64)
     return Motion(rigid_body_frame(mechanism.frame(expected), mechanism.frame(measured), weights, _ROTATION_WEIGHT))

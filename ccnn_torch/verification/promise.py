@@ -37,6 +37,8 @@ def repeated(place: Tensor, before: Tensor, after: Tensor, groups: Tensor) -> Re
     Returns:
         Figures over the targets that were reached three times or more; None where none was.
     """
+    known = ~(place.isnan() | before.isnan() | after.isnan()).any(-1)
+    place, before, after, groups = place[known], before[known], after[known], groups[known]
     chosen = [groups == k for k in torch.nonzero(torch.bincount(groups) >= _CYCLES).squeeze(-1).tolist()]
     if not chosen:
         return None
@@ -59,7 +61,7 @@ def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[s
     """The entry `metrics`, `promise` of a model's card; None with fewer than two configurations.
 
     Args:
-        before, after: pose error of the held-out rows, `s`.
+        before, after: pose error of the held-out rows, `s`; NaN where it was not measured.
         groups: configuration of each row, `s`, numbered from 0 without a gap.
 
     Returns:
@@ -73,12 +75,14 @@ def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[s
     def part(unit: str, first: Tensor | None, last: Tensor | None) -> dict[str, Any] | None:
         if first is None or last is None:
             return None
-        square = last.square()
+        square, there = last[~last.isnan()].square(), groups[~last.isnan()]
+        if len(torch.unique(there)) < 2:
+            return None
         return {
             "unit": unit,
-            "before": float(first.square().mean().sqrt()),
+            "before": float(first.square().nanmean().sqrt()),
             "rms": float(square.mean().sqrt()),
-            "spread": max(_spread(square, groups), _LEAST_SPREAD),
+            "spread": max(_spread(square, torch.unique(there, return_inverse=True)[1]), _LEAST_SPREAD),
         }
 
     return {
@@ -118,6 +122,8 @@ def paired_gain(before: Tensor, after: Tensor, groups: Tensor) -> bool:
     """Whether squared errors fell: a paired t test over configurations, one-sided at 95 %; `s` each."""
     from scipy.stats import t
 
+    known = ~after.isnan()
+    before, after, groups = before[known], after[known], torch.unique(groups[known], return_inverse=True)[1]
     gain = before.square() - after.square()
     count = int(groups.max()) + 1
     mean = float(gain.mean())

@@ -19,6 +19,7 @@ from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import make_learner
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records
@@ -157,18 +158,20 @@ def _errors(
         nominal_too: whether it may learn everything, on the nominal machine.
     """
     joints, pose, weight = records.joints, records.pose, settings["rotation_weight"]
+    gaps = pose.isnan().any(-1)
     frames, _ = frames_of_repeats(mechanism, records, folds, "geometry" if physical else "")
     held = torch.zeros(len(folds), len(joints), dtype=torch.float64)
     for k, fold in enumerate(folds):
         held[k, fold.test] = 1.0
 
     def square(reached: Tensor, wanted: Tensor) -> Tensor:
-        error = mechanism.pose_error(wanted, reached)
-        turned = 0.0 if error.rotation is None else weight**2 * error.rotation.square()
-        return (error.position.square() + turned).expand(len(folds), -1)
+        # Of a row with gaps what was measured counts.
+        parts = [torch.where(gaps, e.nan_to_num(), e) for e in mechanism.pose_error(wanted, reached) if e is not None]
+        turned = weight**2 * parts[1].square() if len(parts) == 2 else 0.0
+        return (parts[0].square() + turned).expand(len(folds), -1)
 
     nominal = joint_deviations(mechanism, joints, pose, parameters=frames, **settings)
-    about = (mechanism, records, folds, frames, nominal.usable)
+    about = (mechanism, records, folds, frames, nominal.known)
     machines = {c[:2]: fit_physics(verdict if c.effects else None, *about, c.identify)[0] for c in physical}
 
     def error(c: Candidate) -> Tensor:
@@ -180,7 +183,8 @@ def _errors(
             for _ in range(_COMMANDS):
                 command = joints - learned(command)
             moved = joints + learned(joints) + (command + learned(command) - joints)
-            return square(mechanism.forward_kinematics(moved, frames, guess=pose), pose)
+            guess = completed(mechanism, joints, pose, frames)
+            return square(mechanism.forward_kinematics(moved, frames, guess=guess), pose)
         moved = joints.expand(len(folds), -1, -1)
         if c.learner:
             targets = physics.targets(joints, pose, settings)
@@ -211,7 +215,7 @@ def _learned(
 ) -> Any:
     """The learner of every fold, trained: commanded joints `[k x] s x n` -> deviations `k x s x n` [SI]."""
     joints = records.joints
-    jacobian = mechanism.jacobian(joints, parameters, guess=records.pose)
+    jacobian = mechanism.jacobian(joints, parameters, guess=completed(mechanism, joints, records.pose, parameters))
     data = dataset_of(mechanism, joints, records.covariates, targets, folds, [seed] * len(folds), jacobian)
     plan = Plan(early_stop=False, patience=None, checkpoint_every=1000)
     one = fit_method(_LEARNER, lambda: make_learner(_LEARNER, _QUICK), data, plan, None, lambda *_: [])

@@ -28,6 +28,7 @@ from ccnn_torch.effects import (
 )
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records
@@ -168,7 +169,9 @@ def fit_physics(
         )
     gravity = default_gravity(mechanism) if verdict is None or verdict.gravity is None else verdict.gravity
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
-    guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
+    guess = None
+    if records.pose.shape[-1] == len(mechanism.pose):
+        guess = completed(mechanism, records.joints, records.pose, None if parameters is None else parameters[0])
     rows = Situation(mechanism, records.joints, covariates, gravity, parameters, guess)
     known, notes = list[Known](), list[str]()
     if verdict is not None:

@@ -24,6 +24,7 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, load_mechanism
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Column, Split
@@ -53,7 +54,7 @@ class Prepared:
             of rows), or None for a nominal machine.
         joints: commanded joints, `r x s x n` [SI]; the repeats of measured records share their rows.
         covariates: `r x s x m` [SI].
-        pose: measured poses, `r x s x p` [SI].
+        pose: measured poses, `r x s x p` [SI]; NaN where not measured.
         pseudoerror: what the poses say about the joints, and what is learned: with `physics` what that leaves.
         total: deviation of the joints of the nominal machine, `r x s x n` [SI]; without these two that is learned.
         identified: geometry with all parameters fitted to the training rows of each repeat, like `parameters`: what a
@@ -216,7 +217,8 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     if isinstance(mechanism, SerialArm) and config.geometry != "none":
         mechanism = mechanism.with_link_frames()
     held = rows_of_test_file(config.split, records.parts)
-    splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds, held, records.joints)
+    pose = completed(mechanism, records.joints, records.pose)
+    splits = _splits(config, mechanism.frame(pose)[0], records.columns, seeds, held, records.joints)
     settings = _pseudoerror_settings(config, mechanism)
     choice, verdict, said = _choice(config, mechanism, records, splits[0], settings, verdict)
     notes = [*doubts, *records.notes, *said, choice.why]
@@ -238,7 +240,7 @@ def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepare
     one_for = "effects" if verdict is not None else "geometry" if choice.identify else ""
     frames, notes = frames_of_repeats(mechanism, records, splits, one_for)
     total = deviations = joint_deviations(mechanism, records.joints, records.pose, parameters=frames, **settings)
-    about = (mechanism, records, splits, frames, total.usable)
+    about = (mechanism, records, splits, frames, total.known)
     learned, physics, geometry = frames, None, None
     # For comparison, where it costs nothing.
     one_frame = frames is not None and frames.shape[1] == 1 and isinstance(mechanism, SerialArm)
@@ -253,7 +255,8 @@ def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepare
     if physics is not None:
         learned = physics.values
         deviations = physics.targets(records.joints, records.pose, settings)
-    jacobian = mechanism.jacobian(records.joints, learned, guess=records.pose)
+    guess = completed(mechanism, records.joints, records.pose, frames)
+    jacobian = mechanism.jacobian(records.joints, learned, guess=guess)
     return Prepared(
         mechanism=mechanism,
         parameters=frames,

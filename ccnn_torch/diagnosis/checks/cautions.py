@@ -313,7 +313,8 @@ def joint_scatter(analysis: Analysis, judgement: Judgement) -> Scatter | None:
     situation, white = analysis.situation, analysis.whitening
     joints = [i for i in range(len(situation.mechanism.joints)) if f"direction{i + 1}" not in situation.covariates]
     columns, y = analysis.plain
-    if not joints or y.shape[-1] < 2 or judgement.outside:
+    # With gaps the channels are not alike, however they are mixed.
+    if not joints or y.shape[-1] < 2 or judgement.outside or white.seen is not None:
         return None
     found = judgement.found
     used = torch.cat([torch.arange(0), *(analysis.dictionary.groups[i] for i in found.members)])

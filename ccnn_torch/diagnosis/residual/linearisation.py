@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import scales
-from ccnn_torch.effects import Acting, Effect, Situation, reached
+from ccnn_torch.effects import Acting, Effect, Situation, filled, measured_channels, reached
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 
@@ -31,14 +31,15 @@ def remainder(
 ) -> Tensor:
     """Measured less reached with the effects, `s x c` [m, rad]; NaN where the machine with them cannot be.
 
-    parameters: of the machine that moves; those of the situation when None.
+    What was not measured (NaN) is 0. parameters: of the machine that moves; those of the situation when None.
     """
-    there = reached(situation, acting, parameters)
-    position, rotation = situation.mechanism.frame(measured)
+    there, seen = reached(situation, acting, parameters), measured_channels(situation, measured)
+    position, rotation = situation.mechanism.frame(filled(situation, measured))
     left = position - there[..., :3]
-    if rotation is None or there.shape[-1] == 3:
-        return left
-    return torch.cat([left, matrix_to_rotation_vector(rotation @ rotation_vector_to_matrix(there[..., 3:]).mT)], -1)
+    if rotation is not None and there.shape[-1] == 6:
+        turn = matrix_to_rotation_vector(rotation @ rotation_vector_to_matrix(there[..., 3:]).mT)
+        left = torch.cat([left, turn], -1)
+    return left if seen is None else torch.where(seen, left, 0.0 * there)
 
 
 def signature_at(situation: Situation, there: Situation, effect: Effect, shape: Tensor) -> Tensor:

@@ -36,7 +36,12 @@ _KNOWN = 50.0
 
 
 def fitted_whitening(
-    residual: Tensor, columns: Sequence[Tensor], channels: Tensor, noise: Tensor | None, usable: Tensor
+    residual: Tensor,
+    columns: Sequence[Tensor],
+    channels: Tensor,
+    noise: Tensor | None,
+    usable: Tensor,
+    seen: Tensor | None = None,
 ) -> Whitening:
     """Noise and row weights from the largest model: of everything that may be there, one by one what explains most of
     what is left, as long as the evidence for it is more than slight.
@@ -47,15 +52,20 @@ def fitted_whitening(
         channels: `c`.
         noise: known standard deviation of each of the c0 channels, or None.
         usable: `s`, False where a row is left out from the start.
+        seen: which values were measured, `s x c0` bool; None = all.
     """
-    rms = residual[usable][:, channels].abs().median(0).values * MAD
+    known, weight = 0.0 if noise is None else _KNOWN, usable.to(residual.dtype)
+    seen = None if seen is None else seen[:, channels]
+    white = Whitening(channels, residual.new_ones(len(channels)), weight, known, seen)
+    rms = white.usual(residual[:, channels], usable) * MAD
     rms = rms.clamp_min(NO_NOISE)
     sigma = rms if noise is None else noise[channels]
-    white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0 if noise is None else _KNOWN)
+    white = replace(white, sigma=sigma)
     shown = [c if len(channels) == c.shape[1] else c[:, channels] for c in columns if c.shape[-1]]
-    shown = [c.to(residual.dtype) for c in shown]
+    shown = [c.to(residual.dtype) if seen is None else c.to(residual.dtype) * seen[..., None] for c in shown]
     every = _Everything(shown, white)
     y = residual[:, channels]
+    count = float(y.numel()) if seen is None else float(seen.sum())
     if noise is None:
         white = replace(white, sigma=sigma * _noise_share(every, y, white).sqrt())
     chosen: list[int] = []
@@ -76,7 +86,7 @@ def fitted_whitening(
         rough = every.roughly_added(white, left)[rest]
         likely = [rest[k] for k in rough.argsort(descending=True)[:_NEXT].tolist()]
         products = [own_products(white.scaled(shown[k]), white.scaled(left), every.size[k]) for k in likely]
-        fits, _ = fit_single_groups([NO_COLUMNS, *products], squares, Prior(float(y.numel()), 0.0, _ANY_SIZE))
+        fits, _ = fit_single_groups([NO_COLUMNS, *products], squares, Prior(count, 0.0, _ANY_SIZE))
         gain = fits.log_evidence[1:] - fits.log_evidence[0]
         best = int(gain.argmax())
         if float(gain[best]) < _SLIGHT:

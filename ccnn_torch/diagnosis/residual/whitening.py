@@ -37,12 +37,14 @@ class Whitening:
         sigma: standard deviation of each [m, rad], `c`.
         weight: of each row, `s`; 0 = set aside.
         known: weight of the prior knowledge of the noise, in values; 0 = estimated from these rows.
+        seen: which values were measured, `s x c` bool; None = all.
     """
 
     channels: Tensor
     sigma: Tensor
     weight: Tensor
     known: float
+    seen: Tensor | None = None
 
     def __call__(self, values: Tensor) -> Tensor:
         """`s x c0` or `s x c0 x m` raw to `s x c` or `s x c x m`, in units of the noise, rows weighted."""
@@ -55,7 +57,26 @@ class Whitening:
     @cached_property
     def scale(self) -> Tensor:
         """What a value of the channels is multiplied by, `s x c` [1/m], [1/rad]."""
-        return self.weight.sqrt()[:, None] / self.sigma
+        scale = self.weight.sqrt()[:, None] / self.sigma
+        return scale if self.seen is None else torch.where(self.seen, scale, 0.0)
+
+    def usual(self, values: Tensor, rows: Tensor) -> Tensor:
+        """Median size of each channel over the values measured in some rows, `c` [m, rad]; values: `s x c`."""
+        if self.seen is None:
+            return values[rows].abs().median(0).values
+        found: Tensor = torch.where(self.seen, values.abs(), torch.nan)[rows].nanmedian(0).values
+        return found.nan_to_num(nan=NO_NOISE)
+
+    @property
+    def times(self) -> Tensor | None:
+        """Rows that count over those in which each channel was measured, `c` [1]; None where all was."""
+        keep = self.keep()
+        return None if self.seen is None else len(keep) / self.seen[keep].sum(0).clamp_min(1).to(self.sigma.dtype)
+
+    def count(self, rows: Tensor | None = None) -> float:
+        """How many values were measured in some rows, by default in those that count."""
+        there = self.keep() if rows is None else rows
+        return float(len(there) * len(self.channels) if self.seen is None else self.seen[there].sum())
 
     def keep(self) -> Tensor:
         """Indices of the rows that count."""
@@ -84,6 +105,10 @@ def reweighted(white: Whitening, left: Tensor, usable: Tensor, free: float) -> W
     """
     c = len(white.channels)
     size = (left / white.sigma).square().sum(-1) / max(free, LEAST_FREE)
+    if white.seen is not None:
+        # As of a row in which all was measured.
+        size = torch.where(white.seen, left / white.sigma, 0.0).square().sum(-1) / max(free, LEAST_FREE)
+        size = size * c / white.seen.sum(-1).clamp_min(1)
     # Brought to the median of chi-squared with c degrees (Wilson and Hilferty).
     size = size * (c * (1 - 2 / (9 * c)) ** 3) / size[usable].median().clamp_min(1e-12)
     gross = size > (_GROSS**2) * max(1.0, c / 2)
@@ -141,7 +166,7 @@ def renewed(white: Whitening, left: Tensor, residual: Tensor, free: float, usabl
     """
     if white.known == 0:
         counted = (white.weight > 0) & usable
-        spread = left[counted].abs().median(0).values * MAD / max(free, LEAST_FREE) ** 0.5
-        rms = residual[counted].abs().median(0).values * MAD
+        spread = white.usual(left, counted) * MAD / max(free, LEAST_FREE) ** 0.5
+        rms = white.usual(residual, counted) * MAD
         white = replace(white, sigma=torch.maximum(spread, _LEAST_NOISE * rms).clamp_min(NO_NOISE))
     return reweighted(white, left, usable, free)

@@ -42,7 +42,7 @@ from ccnn_torch.diagnosis.search.convergence import (
     known_shapes,
     most_probable_shapes,
 )
-from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
+from ccnn_torch.effects import Acting, Effect, Situation, measured_channels, pose_residual
 from ccnn_torch.evidence.beam import search
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of, groups_of
@@ -223,7 +223,8 @@ def _about_nominal(situation: Situation, measured: Tensor, effects: Sequence[Eff
     largest = residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)
     atoms = [a for a in atoms if float((a.columns[:, channels] / largest[:, None]).abs().max()) > _SHOWN]
     everything = [a.columns for a in (*atoms, *rest) if not (a.is_discrepancy and a.name.startswith("joint"))]
-    white = fitted_whitening(residual, [fitted, *everything], channels, noise, usable)
+    seen = measured_channels(situation, measured)
+    white = fitted_whitening(residual, [fitted, *everything], channels, noise, usable, seen)
 
     of_effects = candidates_about_nominal(situation, atoms, white, residual, usable, fitted)
     local = local_discrepancies(situation, only_usable(situation.jacobian, usable), residual, white, fitted)
@@ -288,6 +289,9 @@ def _about_best_set(state: Analysis) -> Analysis | None:
 
 def _with_shared_noise(state: Analysis) -> Analysis:
     """The same candidates under noise that rows share, where the best sets found are more probable then."""
+    if state.whitening.seen is not None:
+        # Rows that lack values have no noise in them that they could share.
+        return state
     atoms, white, keep, dof = state.atoms, state.whitening, state.whitening.keep(), state.dictionary.noise_dof
     sets = {(), state.best_of_library.members, state.found[0].members}
 
@@ -301,7 +305,8 @@ def _with_shared_noise(state: Analysis) -> Analysis:
             raw = [state.residual[..., None], *(atoms[i].columns for i in members)]
             target, *columns = _whitened(white, state.fitted, correlation, raw)
             x = torch.cat([target[..., :0], *columns], -1)
-            fit = fit_sets(grams_of(x, target[..., 0]), [groups_of(columns)], dof)
+            grams = grams_of(x, target[..., 0])._replace(values=white.count())
+            fit = fit_sets(grams, [groups_of(columns)], dof)
             best = max(best, float(fit.log_evidence[0]) + sum(atoms[i].log_prior for i in members))
         return score + best
 
@@ -325,10 +330,11 @@ def _searched(
     first, *columns = _whitened(white, fitted, correlation, [target[..., None], *(a.columns for a in atoms)], few)
     y = first[..., 0]
     # Noise that was given is right to some per cent, however many rows there are.
-    known = white.known * (1 + y.numel() / _VALUES_A_UNIT)
-    dictionary, found = search(atoms, columns, y, known, quick=few is not None)
+    values = white.count(few)
+    known = white.known * (1 + values / _VALUES_A_UNIT)
+    dictionary, found = search(atoms, columns, y, known, quick=few is not None, values=values)
     # The largest model knows no shapes: where these are most of the gap the best set leaves far less.
-    left = found[0].rss / max(y.numel() - found[0].effective, 1.0)
+    left = found[0].rss / max(values - found[0].effective, 1.0)
     floor = min(float((rows.sigma / white.sigma).square().mean()), 1.0)
     # Nor does it know what rows share.
     floor = left if white.known == 0 and (correlation.value or left < _NOISE_REDUCTION * floor) else floor

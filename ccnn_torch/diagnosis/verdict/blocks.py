@@ -45,9 +45,14 @@ class Blocks:
     def gap(self, held: HeldOut, position: bool, before: Tensor | None = None) -> Gap:
         """In position [m] or rotation [rad]; before: `s x c` [m, rad], None = the nominal residual."""
         channels = self.position if position else ~self.position
+        # Means are over what was measured.
+        times = self.analysis.whitening.times
+        before = self.before if before is None else before
+        held = held if times is None else HeldOut(held.left * times.sqrt(), held.uncertain * times)
         free = self.analysis.dictionary.grams.values - self.judgement.found.effective
         dof = 0.0 if self.analysis.noise_is_known else max(free, 1.0)
-        return shrink_of(self.before if before is None else before, held, self.floor, channels, dof, self.draws)
+        before = before if times is None else before * times.sqrt()
+        return shrink_of(before, held, self.floor, channels, dof, self.draws)
 
     def main(self, held: HeldOut, before: Tensor | None = None) -> Gap:
         """In position where the machine has one, else in rotation; before: as for `gap`."""
@@ -88,7 +93,8 @@ def noise_floor(analysis: Analysis) -> Tensor:
     free = max(1 - best.effective / analysis.dictionary.grams.values, LEAST_FREE)
     # No more than the richest fit leaves.
     share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)
-    return (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * share
+    noise = (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * share
+    return noise if white.times is None else noise * white.times
 
 
 def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:

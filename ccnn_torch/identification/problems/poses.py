@@ -23,6 +23,7 @@ from ccnn_torch.identification.problems.whitened import (
     whitened_problem,
 )
 from ccnn_torch.mechanisms import Mechanism, Seen
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
@@ -156,6 +157,8 @@ def forward_problem(
     at the starting geometry. Without any noise given, angles are multiplied by `rotation_weight` and the variance is
     estimated from the fit.
 
+    A coordinate that was not measured in a row (NaN) is no equation there; of rx, ry, rz all three are lacking then.
+
     Args:
         mechanism: serial arms, and whatever has its forward kinematics exactly; iterative ones start from the
             measured pose.
@@ -167,6 +170,10 @@ def forward_problem(
     Raises:
         InputError: as `inverse_problem`.
     """
+    known = ~pose.isnan()
+    # What is not measured is filled in, so that all is finite, and left out of the residual.
+    about = None if start is None else start[..., None, :]
+    pose = completed(mechanism, joints, pose, about)
     rows, whole, selection, geometry = _begun(mechanism, joints, pose, weights, choice, start)
     names = [c.name for c in mechanism.pose]
     angles = torch.tensor([c.unit == "rad" for c in mechanism.pose], device=rows.pose.device)
@@ -174,6 +181,7 @@ def forward_problem(
     rest = [i for i in range(mechanism.compared) if i not in turning]
     order = [*rest, *turning]
     turns = (rotation_vector_to_matrix(rows.pose[..., turning]).flatten(-2),) if turning else ()
+    seen = None if bool(known.all()) else known[..., order].reshape(-1, *rows.pose.shape[-2:])
 
     def difference(full: Tensor, q: Tensor, x: Tensor, *measured: Tensor) -> Tensor:
         """In the order of `order`."""
@@ -190,9 +198,11 @@ def forward_problem(
         return torch.cat([gap, matrix_to_rotation_vector(rotation @ back)], dim=-1)
 
     def gap(values: Tensor, q: Tensor, x: Tensor, *more: Tensor) -> Tensor:
-        return difference(geometry(values, *more[len(turns) :]), q, x, *more[: len(turns)])
+        found = difference(geometry(values, *more[len(turns) + len(shown) :]), q, x, *more[: len(turns)])
+        return torch.where(more[len(turns)] > 0, found, 0.0) if shown else found
 
-    data = (rows.joints, rows.pose, *turns, *geometry.data)
+    shown = () if seen is None else (seen.to(torch.float64),)
+    data = (rows.joints, rows.pose, *turns, *shown, *geometry.data)
     first = gap(selection.start[:, None], *data)
     check_finite(first, rows.weights > 0, rows.joints, mechanism.joints, mechanism.name, [names[i] for i in order])
 
@@ -215,4 +225,5 @@ def forward_problem(
         [names[i] for i in order],
         f"pose coordinate of mechanism '{mechanism.name}'",
         pose_noise is not None,
+        seen=seen,
     )

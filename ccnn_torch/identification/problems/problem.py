@@ -42,6 +42,8 @@ class Problem:
         weights: `r x s` [1]; 0 leaves a row out.
         channels: the `c` columns of the residual.
         noise_known: whether the residual's unit is the known noise; if not, its variance is estimated from the fit.
+        missing: how many channels were not measured in each row, `r x s` (r = 1 where the machines share them); the
+            residual is 0 there. None where all were.
     """
 
     parameters: tuple[Parameter, ...]
@@ -53,14 +55,21 @@ class Problem:
     weights: Tensor
     channels: tuple[Channel, ...]
     noise_known: bool = True
+    missing: Tensor | None = None
+
+    @property
+    def equations(self) -> Tensor:
+        """Residuals that count of each machine, `r`."""
+        used, none = self.weights > 0, torch.zeros(1, 1, dtype=torch.int64)
+        return (used * (len(self.channels) - (none if self.missing is None else self.missing))).sum(-1)
 
 
 def check_equations(problem: Problem) -> None:
     """Refuse a problem with fewer equations than parameters; a prior counts as one equation."""
-    rows = int((problem.weights > 0).sum(-1).min())
+    rows, equations = int((problem.weights > 0).sum(-1).min()), int(problem.equations.min())
     channels, k = len(problem.channels), len(problem.parameters)
     held = int(torch.isfinite(problem.prior_sd).sum())
-    if rows * channels + held < k:
+    if equations + held < k:
         needed = -(-(k - held) // channels)
         raise InputError(
             f"{rows} rows of {channels} equations{f' and {held} priors' if held else ''} cannot determine {k} free "
@@ -112,7 +121,11 @@ def joined(parts: Sequence[Problem], shared: int) -> Problem:
         channels=next(p.channels for p in parts if len(p.channels) == width),
         noise_known=all(p.noise_known for p in parts),
     )
-    equations = sum(int((p.weights > 0).sum(-1).min()) * len(p.channels) for p in parts)
+    if any(p.missing is not None for p in parts):
+        none = torch.zeros(1, 1, dtype=torch.int64)
+        own = [(none if p.missing is None else p.missing).expand(1, n) for p, n in zip(parts, counts, strict=True)]
+        problem = dataclasses.replace(problem, missing=torch.cat(own, -1))
+    equations = sum(int(p.equations.min()) for p in parts)
     unknown = len(problem.parameters) - int(torch.isfinite(problem.prior_sd).sum())
     if equations < unknown:
         raise InputError(f"{equations} equations cannot determine {unknown} free parameters; measure more, or fix some")
@@ -226,7 +239,7 @@ class WeightedRows:
         self.weights = problem.weights if whole else problem.weights[:, kept]
         self.alike = whole and bool((self.weights == 1).all())
         self.channels = len(problem.channels)
-        self.equations = used.sum(-1) * self.channels
+        self.equations = problem.equations
         self.scale = problem.scale
         self.start = problem.start
         self.pull = (problem.scale / problem.prior_sd) ** 2

@@ -266,6 +266,7 @@ def whitened_problem(
     what: str,
     noise_known: bool,
     per_leg: bool = False,
+    seen: Tensor | None = None,
 ) -> Problem:
     """The problem with the residual L⁻¹ gap, L Lᵀ being the noise of a row.
 
@@ -277,6 +278,7 @@ def whitened_problem(
         what: what the entries are, for messages.
         noise_known: whether the covariance is the noise itself or only its proportions.
         per_leg: divide by the diagonal alone, and leave out entries that no free parameter moves.
+        seen: which entries were measured, `r x s x c` bool, where the gap is 0 in the others; all when None.
     """
     if not noise_known and bool(torch.isfinite(selection.prior_sd).any()):
         raise InputError("parameters.prior: a prior can be weighed against the rows only if their noise is given")
@@ -289,6 +291,10 @@ def whitened_problem(
         raise InputError(f"parameters.free: no {what} depends on {free}; free others")
     diagonal = covariance is None or per_leg or bool((covariance == _only_diagonal(covariance)).all())
     whiten: tuple[Tensor, ...] = ()
+    if covariance is not None and seen is not None:
+        # What was not measured is independent of the rest, so that this is decorrelated alone.
+        both = seen[..., None] & seen[..., None, :]
+        covariance = torch.where(both, covariance, torch.eye(c, dtype=torch.float64))
     if covariance is not None:
         covariance = covariance.expand(1, rows.pose.shape[1], c, c) if covariance.dim() < 4 else covariance
         root = _shared(inverse_root(_only_diagonal(covariance) if diagonal else covariance, rows.weights > 0))
@@ -305,6 +311,7 @@ def whitened_problem(
         weights=rows.weights,
         channels=tuple(Channel(names[i], _leg(selection.parameters, moved[i]) if diagonal else None) for i in kept),
         noise_known=noise_known,
+        missing=None if seen is None else (~seen).sum(-1),
     )
     check_equations(problem)
     return problem

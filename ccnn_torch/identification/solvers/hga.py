@@ -63,9 +63,9 @@ class Objective:
         """The objective of one machine alone."""
         problem, one = self.problem, slice(machine, machine + 1)
         data = tuple(d if len(d) == 1 else d[one] for d in problem.data)
-        return Objective(
-            dataclasses.replace(problem, start=problem.start[one], data=data, weights=problem.weights[one])
-        )
+        missing = problem.missing if problem.missing is None or len(problem.missing) == 1 else problem.missing[one]
+        start, weights = problem.start[one], problem.weights[one]
+        return Objective(dataclasses.replace(problem, start=start, data=data, weights=weights, missing=missing))
 
     def values(self, points: Tensor, machines: Tensor | None = None) -> Tensor:
         """From coordinates to parameters: `m x … x k` [1] of these machines to the same [SI]."""

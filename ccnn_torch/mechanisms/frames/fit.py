@@ -190,7 +190,7 @@ def fit_frames(
     Args:
         arm: the arm; `arm.unknown_frames` lists what is fitted, `arm.frame_per` and `arm.tool_per` per which groups.
         joints: `s x n` [SI].
-        pose: measured, `s x p` [SI].
+        pose: measured, `s x p` [SI]; a row that lacks a part of it (NaN) is left out.
         weights: `r x s` or `s` [1]; 0 leaves a row out (held-out rows); all 1 when None.
         rotation_weight: of orientation against position [m/rad].
         columns: the records' other columns, `s` each; needed for `frame_per` and `tool_per`.
@@ -203,6 +203,7 @@ def fit_frames(
         InputError: too few training rows, in all or in a group, or a group column that is not there.
     """
     weights = torch.ones(len(joints), dtype=torch.float64) if weights is None else weights
+    weights, pose = torch.where(pose.isnan().any(-1), 0.0, weights), pose.nan_to_num()
     grouped = bool(arm.frame_per or arm.tool_per)
     lead = weights.shape[:-1]
     if not arm.unknown_frames:

@@ -95,6 +95,10 @@ class Framed(Around):
         self.low.copy_(samples.amin(0) - 1e-6)
         self.high.copy_(samples.amax(0) + 1e-6)
 
+    def controlled(self) -> Mechanism:
+        """As of the mechanism inside."""
+        return self.mechanism.controlled()
+
     def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
         """Samples of the mechanism, as the measuring device sees them; `count x p` [SI]."""
         return self._seen(self.mechanism.sample_workspace(count, generator), self.nominal)
@@ -149,8 +153,12 @@ class Framed(Around):
         return self.mechanism.reachable(closest, self._split(values)[1])
 
     def inlying_frames(self, joints: Tensor, pose: Tensor, weights: Tensor | None = None) -> Tensor:
-        """As `fitted_frames` to the rows that are no gross outliers; weights: `... x s`, 0 leaves a row out."""
+        """As `fitted_frames` to the rows that are no gross outliers; weights: `... x s`, 0 leaves a row out.
+
+        A row that lacks a part of its pose (NaN) is left out.
+        """
         weights = torch.ones(joints.shape[:-1], dtype=joints.dtype) if weights is None else weights
+        weights, pose = torch.where(pose.isnan().any(-1), 0.0, weights), pose.nan_to_num()
         fine = weights
         for _ in range(3):
             values = self.fitted_frames(joints, self.frame(pose), fine)

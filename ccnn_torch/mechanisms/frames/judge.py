@@ -52,7 +52,7 @@ def judge_frames(
     if not arm.unknown_frames:
         return []
     error = arm.pose_error(arm.forward_kinematics(joints, values), pose)
-    used = (torch.ones(len(joints)) if weights is None else weights) > 0
+    used = ((torch.ones(len(joints)) if weights is None else weights) > 0) & ~pose.isnan().any(-1)
     median = _median(error.position, used)
     turned = None if error.rotation is None else _median(error.rotation, used)
     rotation, place = arm.flange(joints)
@@ -60,6 +60,7 @@ def judge_frames(
     motion = float((tool - tool.mean(-2, keepdim=True)).norm(dim=-1).square().mean(-1).sqrt().max())
     limit = min(_SHARE * arm.reach, _OF_MOTION * motion)
     length = error.position if error.rotation is None else torch.hypot(error.position, ROTATION_WEIGHT * error.rotation)
+    length = length.nan_to_num()
     channels, free = (3, 9) if error.rotation is None else (6, 12)
     far = used & ~inlying(length, used, channels, free)
     share = float((far.sum(-1) / used.expand(far.shape).sum(-1)).max())

@@ -69,6 +69,10 @@ class Seen(Around):
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 6` or `x 3`."""
         return frame_gap(self.frame(self.forward_kinematics(joints, parameters, pose)), self.frame(pose), 1.0)
 
+    def controlled(self) -> Mechanism:
+        """As of the mechanism inside."""
+        return self.mechanism.controlled()
+
     def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
         """What is seen of samples of the mechanism; `count x p` [SI]."""
         return self.forward_kinematics(self.mechanism.sample_joints(count, generator))
@@ -193,6 +197,14 @@ class Partial(Seen):
         for i, k in enumerate(self.seen):
             columns[k] = pose[..., i]
         return torch.stack(columns, -1)
+
+
+def completed(mechanism: Mechanism, joints: Tensor, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+    """Poses `... x p` with what was not measured (NaN) as the machine has it at the joints."""
+    if not bool(pose.isnan().any()):
+        return pose
+    given = pose if mechanism.compared < pose.shape[-1] else None
+    return torch.where(pose.isnan(), mechanism.forward_kinematics(joints, parameters, given), pose)
 
 
 def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "records") -> Mechanism:

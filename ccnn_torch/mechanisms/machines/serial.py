@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.branches import commanded_joints
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative, nearest
 from ccnn_torch.mechanisms.pose import frame_gap
@@ -273,6 +274,15 @@ class SerialArm(Mechanism):
         twin.nominal[:kept] = self.nominal[:kept]
         twin._follow_nominal()
         return twin
+
+    def controlled(self) -> SerialArm:
+        """The arm of its file in its own base; at the flange where its tool is unknown. Poses have an orientation."""
+        known = {"base": (0.0,) * 6, "tool_offset": None, "unknown_frames": (), "orientation": "rotation_vector"}
+        return SerialArm(**{**self.recipe["keys"], **known})
+
+    def commanded_joints(self, pose: Tensor, guess: Tensor | None = None) -> Tensor:
+        """See `Mechanism.commanded_joints`; of three joints the positions `s x 3` are enough."""
+        return commanded_joints(self if pose.shape[-1] == 6 else self.with_orientation("none"), pose, guess)
 
     def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:
         """Uniform within the joint limits, `count x n` [SI]."""

@@ -1,0 +1,189 @@
+"""Records without joints: what was commanded is a pose, and the joints are the controller's inverse kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import fsolve
+from scipy.spatial.transform import Rotation
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import SerialArm, load_mechanism
+from ccnn_torch.records import load_records, write_table
+from ccnn_torch.records.read_table import read_table
+from ccnn_torch.starter import starter_config
+
+Array = NDArray[np.float64]
+Cli = Callable[..., tuple[int, str, str]]
+
+# A delta printer in millimetres: rods of 250 on towers at a radius of 130 less that of the platform, 0.3 mm wrong.
+ROD, RADIUS, ANGLES = 250.0, 130.0, np.deg2rad([0.0, 120.0, 240.0])
+TRUE = (ROD + np.array([0.3, -0.2, 0.4]), RADIUS + np.array([0.4, -0.5, 0.2]), ANGLES + np.deg2rad([0.1, -0.15, 0.05]),
+        np.array([0.3, -0.2, 0.1]))  # fmt: skip
+NOMINAL = (np.full(3, ROD), np.full(3, RADIUS), ANGLES, np.zeros(3))
+KEYS = "mechanism_keys={base: 0.16, platform: 0.03, rod: 0.25}"
+
+
+def carriages(place: Array, machine: tuple[Array, ...]) -> Array:
+    """Heights of the carriages, `... x 3` [mm]."""
+    rod, radius, angle, offset = machine
+    across = radius * np.cos(angle) - place[..., :1], radius * np.sin(angle) - place[..., 1:2]
+    return np.asarray(place[..., 2:] + np.sqrt(rod**2 - across[0] ** 2 - across[1] ** 2) - offset)
+
+
+def reached(commanded: Array) -> Array:
+    """Where the true printer goes when its controller is told to go somewhere, `s x 3` [mm]."""
+    heights = carriages(commanded, NOMINAL)
+    return np.array([fsolve(lambda p, h=h: carriages(p, TRUE) - h, c) for h, c in zip(heights, commanded, strict=True)])
+
+
+def places(count: int, seed: int) -> Array:
+    return np.random.default_rng(seed).uniform([-70, -70, 0], [70, 70, 150], (count, 3))
+
+
+def columns(values: Array, name: str) -> dict[str, Array]:
+    return {f"{name.format(axis)}[mm]": values[:, k] for k, axis in enumerate("xyz")}
+
+
+def test_a_printer_without_joints_is_identified_and_corrected(
+    tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    commanded = places(60, 0)
+    noise = np.random.default_rng(1).normal(0, 0.01, commanded.shape)
+    write_table(tmp_path / "r.csv", columns(commanded, "goal_{}") | columns(reached(commanded) + noise, "{}"))
+    about = ["records=r.csv", "mechanism=delta_linear", KEYS]
+    code, _, err = cli("identify", *about, "out=found")
+    assert code == 0, err
+    assert "the joints are the nominal inverse kinematics of the commanded poses goal_x, goal_y, goal_z" in " ".join(
+        (tmp_path / "found" / "report.html").read_text().split()
+    )
+    wanted = places(40, 2)
+    for name, option in (("{}", ["--pose"]), ("goal_{}", [])):
+        write_table(tmp_path / "wanted.csv", columns(wanted, name))
+        code, _, err = cli("compensate", "found/identified.yaml", "wanted.csv", "commands.csv", *option)
+        assert code == 0, err
+        table = read_table(tmp_path / "commands.csv")
+        commands = np.stack([table.raw(f"command_{axis}") for axis in "xyz"], -1)
+        before, after = (np.linalg.norm(reached(c) - wanted, axis=1) for c in (wanted, commands))
+        assert before.mean() > 0.3 and after.max() < 0.04, (before.mean(), after.max())
+
+
+def test_distances_between_commanded_places(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    first, second = places(80, 3), places(80, 4)
+    distance = np.linalg.norm(reached(first) - reached(second), axis=1) + np.random.default_rng(5).normal(0, 0.01, 80)
+    both = columns(first, "goal_{}") | columns(second, "goal_{}_b")
+    write_table(tmp_path / "d.csv", both | {"distance[mm]": distance})
+    joints = carriages(first, NOMINAL), carriages(second, NOMINAL)
+    plain = {f"q{k + 1}{e}[mm]": q[:, k] for q, e in zip(joints, ("", "_b"), strict=True) for k in range(3)}
+    write_table(tmp_path / "q.csv", plain | {"distance[mm]": distance})
+    found = []
+    for name in ("d", "q"):
+        args = (f"records={name}.csv", "mechanism=delta_linear", KEYS, "constraint={kind: distances}", f"out={name}")
+        code, _, err = cli("identify", *args)
+        assert code == 0, err
+        found.append(load_mechanism(str(tmp_path / name / "identified.yaml")).nominal.numpy())
+    np.testing.assert_allclose(found[0], found[1], atol=1e-9)
+
+
+ARM = """
+robot: small arm
+dof: 6
+units: {length: m, angle: rad}
+convention: standard Denavit-Hartenberg
+a: [0, -0.612, -0.5723, 0, 0, 0]
+alpha: [1.5707963267948966, 0, 0, 1.5707963267948966, -1.5707963267948966, 0]
+d: [0.1273, 0, 0, 0.163941, 0.1157, 0.0922]
+theta: [0, 0, 0, 0, 0, 0]
+base_frame: unknown
+tool_frame: {tool}
+"""
+
+
+def arm(tmp_path: Path, tool: str = "unknown") -> SerialArm:
+    (tmp_path / "arm.yaml").write_text(ARM.replace("{tool}", tool))
+    machine = load_mechanism(str(tmp_path / "arm.yaml"))
+    assert isinstance(machine, SerialArm)
+    return machine
+
+
+def path_of(machine: SerialArm, rows: int = 30) -> tuple[torch.Tensor, Array]:
+    """Joints of a walk from home, and the flange's poses there."""
+    steps = 0.15 * torch.randn(rows, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    joints = machine.home_joints + steps.cumsum(0)
+    return joints, machine.forward_kinematics(joints).numpy()
+
+
+def test_an_arms_joints_are_those_of_the_previous_rows_branch(tmp_path: Path) -> None:
+    machine = arm(tmp_path)
+    joints, pose = path_of(machine)
+    angles = np.rad2deg(Rotation.from_rotvec(pose[:, 3:]).as_euler("ZYX"))
+    goals = {f"goal_{c}[mm]": 1e3 * pose[:, k] for k, c in enumerate("xyz")}
+    goals |= {f"goal_kuka_{c}[deg]": angles[:, k] for k, c in enumerate("abc")}
+    measured = {f"{c}[m]": pose[:, k] for k, c in enumerate("xyz")}
+    write_table(tmp_path / "r.csv", goals | measured)
+    records = load_records(tmp_path / "r.csv", machine, learns=False)
+    assert float(machine.wrap(records.joints - joints).abs().max()) < 1e-6
+    assert any("nearest to the previous row's" in note for note in records.notes)
+    # The base of the model is where the tracker is; commands are in the arm's own base, at the tool of its file.
+    at = machine.with_nominal(
+        machine.nominal + torch.cat([torch.full((6,), 0.3), torch.zeros(len(machine.nominal) - 6)])
+    )
+    assert float((load_records(tmp_path / "r.csv", at, learns=False).joints - records.joints).abs().max()) < 1e-9
+    longer = arm(tmp_path, "[0, 0, 0.1, 0, 0, 0]")
+    away = load_records(tmp_path / "r.csv", longer, learns=False).joints
+    assert (
+        float((longer.controlled().forward_kinematics(away)[:, :3] - torch.from_numpy(pose[:, :3])).abs().max()) < 1e-6
+    )
+
+
+def test_what_was_commanded_is_refused_by_row(tmp_path: Path) -> None:
+    machine = arm(tmp_path)
+    _, pose = path_of(machine)
+    place = {f"{c}[m]": pose[:, k] for k, c in enumerate("xyz")}
+    goals = {f"goal_{name}": values for name, values in place.items()}
+    turns = {f"goal_{c}[rad]": pose[:, k + 3] for k, c in enumerate(("rx", "ry", "rz"))}
+    file = tmp_path / "r.csv"
+
+    def refused(columns: dict[str, Array], *parts: str) -> None:
+        write_table(file, columns)
+        with pytest.raises(InputError) as error:
+            load_records(file, machine, learns=False)
+        assert all(part in str(error.value) for part in parts), error.value
+
+    refused(
+        place, "there is no column 'q1'; give the joints (q1[rad] …), or the commanded pose as goal_x[m], goal_y[m]"
+    )
+    refused(goals | place, "do not determine the 6 joints", "goal_rx, goal_ry, goal_rz")
+    far = goals | turns | {"goal_x[m]": np.where(np.arange(30) == 7, 9.0, pose[:, 0])}
+    refused(far | place, "no joints for the pose goal_x = 9 m", "line 9 (row 8)")
+    lacking = {name: values for name, values in (goals | turns).items() if name != "goal_z[m]"}
+    refused(lacking | place, "there is no column 'goal_z'")
+    # Joints count where a file has them.
+    joints = {f"q{k + 1}[rad]": path_of(machine)[0][:, k].numpy() for k in range(6)}
+    write_table(file, far | place | joints)
+    assert np.array_equal(load_records(file, machine, learns=False).joints[:, 0].numpy(), joints["q1[rad]"])
+
+
+def test_a_coordinate_that_a_machine_cannot_move_is_not_needed(tmp_path: Path) -> None:
+    gantry = SerialArm("gantry", "urdf", [[0, 0, 0, 0, 0, 0]] * 3, ["prismatic"] * 3, axes=np.eye(3).tolist())
+    place = places(20, 6)
+    write_table(tmp_path / "r.csv", columns(place, "goal_{}") | columns(place, "{}"))
+    found = load_records(tmp_path / "r.csv", gantry, learns=False)
+    np.testing.assert_allclose(found.joints.numpy(), place / 1e3, atol=1e-9)
+
+
+def test_new_recognises_a_commanded_pose(tmp_path: Path) -> None:
+    place = places(20, 6)
+    write_table(tmp_path / "r.csv", {f"Cmd_{c}": place[:, k] for k, c in enumerate("XYZ")} | columns(place, "{}"))
+    text, ready = starter_config(tmp_path / "r.csv", tmp_path / "c.yaml", "delta_linear", "mm,deg")
+    assert ready and '"Cmd_X": "goal_x[mm]"' in text and "inverse kinematics of the commanded pose" in text
+    write_table(tmp_path / "r.csv", columns(place, "{}"))
+    with pytest.raises(InputError, match=r"no column looks like a joint .* or a commanded pose \(goal_x"):
+        starter_config(tmp_path / "r.csv", tmp_path / "c.yaml")
