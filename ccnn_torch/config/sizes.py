@@ -80,7 +80,8 @@ def sizes_of_pose(given: Size | Mapping[str, Size], coordinates: Sequence[Coordi
     base = size(given, "rad" if angles else "m", key)
     if base < 0:
         raise InputError(f"{key}: a standard deviation is not negative, got {given}")
-    return torch.tensor([base / ANGLE_ARM if c.unit == "rad" and not angles else base for c in coordinates], dtype=torch.float64)
+    turned = base if angles else base / ANGLE_ARM
+    return torch.tensor([turned if c.unit == "rad" else base for c in coordinates], dtype=torch.float64)
 
 
 def sizes_of_joints(given: Size | Mapping[str, Size], coordinates: Sequence[Coordinate], key: str) -> Tensor:
