@@ -15,6 +15,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import check_values, dump_yaml, parse_yaml, read_yaml
 
 # Keys whose value is always text: a path may hold a colon, a name may be 2024.
+_MACHINES = ("mechanism", "first", "second")
 _TEXT = ("name", "out", "records", "transfer", "mechanism")
 
 # Prefix of a file in `effects`.
@@ -95,6 +96,9 @@ def _changed(key: str, value: Any, change: Callable[[str], str]) -> Any:
         return {**value, "beside": beside}
     if key == "split" and isinstance(value, dict) and "test" in value:
         return {**value, "test": _changed("split.test", value["test"], change)}
+    if key == "mechanism_keys" and isinstance(value, dict):
+        # Of a machine that holds others: framed, partial, instrument, pair.
+        return {k: _changed("mechanism", v, change) if k in _MACHINES else v for k, v in value.items()}
     if key == "auto" and isinstance(value, dict):
         return {name: _changed(f"auto.{name}", entry, change) for name, entry in value.items()}
     if key in _PLUGINS and isinstance(value, list):

@@ -25,7 +25,7 @@ from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.effects.found_machine import found_block
 from ccnn_torch.errors import InputError, RowsError
-from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm, as_measured, fit_unknown, judge_frames
+from ccnn_torch.mechanisms import BlackBox, Instrument, Mechanism, SerialArm, as_measured, fit_unknown, judge_frames
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import Records, load_records
@@ -239,6 +239,9 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         acting, values = fit_jointly(situation, analysis.measured, known, fine, loose)
         used = used_covariates(situation, acting)
         situation = replace(situation, covariates={n: v for n, v in situation.covariates.items() if n in used})
+        if isinstance(situation.mechanism, Instrument):
+            situation = situation.whole
+            values = values[..., : len(situation.mechanism.geometry)]
         return found_block(situation, values, acting, covariate_units(situation.mechanism))
     except InputError:
         # A machine that no file describes, or an effect that needs what was before a row.

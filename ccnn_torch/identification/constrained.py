@@ -124,7 +124,7 @@ def fit_constraint(
     about = choice_of(config, mechanism)
     free = select_parameters(mechanism.geometry, ParameterChoice(about.free, [*about.fixed, *held], about.tied))
     of_machine = [n for group in free.groups for n in group]
-    tool = [n for n in of_machine if n.startswith("tool_") and "tool" not in unknown]
+    tool = [] if isinstance(mechanism, Instrument) else [n for n in of_machine if n.startswith("tool_")]
     choice = ParameterChoice(of_machine, (), about.tied, {**_priors(config, mechanism, of_machine), **about.prior})
     before = _tool_first(mechanism, build, tool, choice)
     solver = solver_of("lm", config)
@@ -339,6 +339,7 @@ def identify_by_constraint(
     mechanism, notes = _machine(config)
     rows = read_constraint(config, mechanism, given)
     rows = _placed(rows)
+    notes += [rows.seen.reading.note] if isinstance(rows.seen, Instrument) and rows.seen.reading.note else []
     mechanism = rows.seen if isinstance(rows.seen, Instrument) else mechanism
     begun = time.perf_counter()
     others, told = _beside(config, mechanism)
@@ -425,6 +426,7 @@ def _constraint(
             for number, label in rows.labels.items()
         ],
         "unknowns": unknowns,
+        "unit": "rad" if _angles_alone(rows) else "m",
         "noise": fit.after.noise,
         "noise_known": config.noise is not None,
         "beside": [

@@ -15,7 +15,7 @@ from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.page import InlineFigure, Page, sections_of
 from ccnn_torch.report.table import Table, table_of
 
-BEFORE_SAYS = "Before: links nominal, the tool's offset fitted."
+BEFORE_SAYS = "Before: links nominal, what is unknown of frames, tool and instrument fitted."
 _HOLDERS = {
     "sockets": "the other rows of its socket put",
     "distances": "the measured distance puts",
@@ -42,7 +42,7 @@ def constraint_table(results: Mapping[str, Any]) -> Table | None:
             (name, f"{number_text(block['value'], 6)} {block['unit']}".removesuffix(" 1"), sd.removesuffix(" 1"))
         )
     count = sum(place["rows"] for place in about["placements"])
-    scale, unit = display_unit("m", about["noise"])
+    scale, unit = display_unit(about.get("unit", "m"), about["noise"])
     source = "as given" if about["noise_known"] else "from the residuals"
     note = (
         f"{count} rows in {len(about['placements'])} groups; standard deviation of one equation "
@@ -57,6 +57,8 @@ def constraint_table(results: Mapping[str, Any]) -> Table | None:
             f" In the same fit: {count_text(one['rows'], 'row')} of {Path(one['records']).name} ({one['kind']}), "
             f"off by {before} {unit} RMS before and {after} {unit} after; none of them is held out."
         )
+    if not rows:
+        return Table("Rows", ("kind", "rows"), ((about["kind"], str(count)),), note)
     return Table(f"What held the tool ({about['kind']})", ("unknown", "value", "standard deviation"), tuple(rows), note)
 
 

@@ -20,6 +20,7 @@ from ccnn_torch.mechanisms.frames.partial import Partial, Seen
 from ccnn_torch.mechanisms.machines.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.machines.five_bar import FiveBar
 from ccnn_torch.mechanisms.machines.overconstrained import Overconstrained2Dof
+from ccnn_torch.mechanisms.machines.pair import Pair
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.machines.sliders import MachineTool, Tripod
 from ccnn_torch.mechanisms.machines.stewart import Stewart
@@ -221,6 +222,12 @@ def _instrument(
     return instrument(_inside(mechanism, keys), kind, link, of_instrument)
 
 
+def _pair(first: str | Mapping[str, Any], second: str | Mapping[str, Any]) -> Pair:
+    """Two arms by their files, or by description."""
+    arms = [_inside(arm, None) for arm in (first, second)]
+    return Pair(*arms)  # type: ignore[arg-type]
+
+
 REGISTRY: dict[str, Callable[..., Mechanism]] = {
     "tripod": Tripod,
     "machine_tool": MachineTool,
@@ -233,6 +240,7 @@ REGISTRY: dict[str, Callable[..., Mechanism]] = {
     "framed": _framed,
     "partial": _partial,
     "instrument": _instrument,
+    "pair": _pair,
 }
 
 _READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
@@ -279,7 +287,7 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
     else:
         mechanism = _call(spec, maker, keys)
-    if (spec in REGISTRY or is_plugin(spec)) and not isinstance(mechanism, Framed | Seen):
+    if (spec in REGISTRY or is_plugin(spec)) and not isinstance(mechanism, Framed | Seen | Pair):
         mechanism.recipe = {"spec": spec, "keys": keys}
     return mechanism
 

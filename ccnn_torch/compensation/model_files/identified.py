@@ -12,6 +12,7 @@ from ccnn_torch.compensation.model_files.metadata import card_of, from_json
 from ccnn_torch.compensation.model_files.signature import check_signature, sign_content, signature_path
 from ccnn_torch.compensation.parts import ROWS, all_over, machine_alone
 from ccnn_torch.effects import default_gravity
+from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.found_machine import FoundMachine, machine_of_block
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.files.write import write_whole
@@ -49,7 +50,8 @@ def load_geometry(path: str | Path, *, public_key: str | Path | None = None, all
     if source.suffix == ".json" and (diagnosed := _diagnosed(path, content, allow_code)) is not None:
         return model_of_machine(path, diagnosed, public_key is not None)
     file = _parsed(path, source, content)
-    nominal, identified = (mechanism_of_file(file, what, allow_code) for what in ("nominal", "value"))
+    # Commands are of the machine, whatever it was seen through.
+    nominal, identified = (inside(mechanism_of_file(file, what, allow_code)) for what in ("nominal", "value"))
     none = torch.zeros(0, 2, dtype=torch.float64)
     about = (default_gravity(nominal), none, (), none, file.columns, file.joint_map)
     machine = FoundMachine(nominal, identified.nominal, [], *about)

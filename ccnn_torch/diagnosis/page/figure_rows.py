@@ -179,7 +179,7 @@ def machine_plot(arrays: Mapping[str, Array], effects: Sequence[str]) -> Plot | 
         return None
     extent = np.ptp(place, axis=0)
     plane = sorted(np.argsort(-extent, kind="stable")[:2].tolist())
-    if extent[plane].min() < _FLAT * extent.max():
+    if extent[plane].min() <= _FLAT * extent.max():
         return None
     width = float(extent[plane].max())
     long = float(np.quantile(np.linalg.norm(before[:, plane], axis=1), 0.9))

@@ -58,7 +58,7 @@ class Instrument(Seen):
         usual = torch.tensor(reading.usual, dtype=torch.float64)
         home = [*reading(at_home, own, usual).tolist(), *reading.usual]
         super().__init__(mechanism, [*reading.read, *reading.given], home, reading.parameters)
-        self.reading, self.link = reading, link
+        self.reading, self.link, self.known = reading, link, False
 
     @property
     def compared(self) -> int:
@@ -68,9 +68,18 @@ class Instrument(Seen):
     @property
     def unknown_frames(self) -> tuple[str, ...]:
         """What is fitted to rows first, as the names of its parameters begin: base and tool of an arm, an anchor."""
+        if self.known:
+            return ()
         unknown: tuple[str, ...] = getattr(self.mechanism, "unknown_frames", ())
         unknown = unknown if self.link is None else tuple(name for name in unknown if name != "tool")
         return (*unknown, *self.reading.unknown)
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """As of a mechanism; nothing is unknown any more where values are not those that it was made with."""
+        super().set_parameters(values)
+        self.known = any(
+            values[g.name] != g.nominal for g in self.geometry if g.name.partition("_")[0] in self.unknown_frames
+        )
 
     def _own_file(self) -> dict[str, Any]:
         keys = {"mechanism": self.mechanism.describe(), "kind": self.reading.kind, **self.reading.keys}

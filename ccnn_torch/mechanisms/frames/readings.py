@@ -44,9 +44,11 @@ class Reading:
         usual: of what is given, where no row says it [SI].
         parameters: its own.
         unknown: beginnings of the names of those of them that are fitted before anything else.
+        note: what a reader of results has to know; empty where nothing.
     """
 
     kind = ""
+    note = ""
     turns = False
     keys: dict[str, Any]
     read: tuple[Coordinate, ...]
@@ -77,6 +79,7 @@ class Camera(Reading):
     """
 
     kind = "camera"
+    note = "A pixel counts as 1 µm on the image: every µm of a position here is a pixel."
     turns = True
     read = (Coordinate("u", "m"), Coordinate("v", "m"))
     given = tuple(Coordinate(f"board_{axis}", "m") for axis in "xyz")

@@ -142,8 +142,10 @@ class Constraint(Result):
     placements: list[Placement]
     unknowns: dict[str, Unknown]
     """where plates, anchors or planes stand"""
+    unit: Literal["m", "rad"] = "m"
+    """of noise"""
     noise: float
-    """standard deviation of one equation [m]: given, or that of the residuals"""
+    """standard deviation of one equation: given, or that of the residuals"""
     noise_known: bool
     beside: list[Beside] = []
     """rows of other kinds in the same fit; none of them is held out"""

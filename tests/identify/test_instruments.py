@@ -1,0 +1,251 @@
+"""Machines seen through an instrument, from rows that code of its own made: camera, wire, level, gauge, two arms."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from identify.instruments import (
+    CORNERS,
+    LENS,
+    TOOL,
+    Arm,
+    Array,
+    arm_file,
+    camera_pose,
+    images,
+    joints,
+    turn,
+    write,
+)
+
+from ccnn_torch import diagnose
+from ccnn_torch.api import identify
+from ccnn_torch.calibration.calibrate import calibrate
+from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.compensation.model_files.identified import load_machine
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Instrument, load_mechanism, mechanism_from_description
+from ccnn_torch.records import load_records
+
+CAMERA: dict[str, Any] = {"kind": "camera", "fx": 900.0, "cx": 640.0, "cy": 360.0}
+ANCHORS = np.array([[1.2, 0.3, 0.1], [-0.8, 1.1, 0.4], [0.2, -1.3, 0.9]])
+PIXEL = 1e-6
+
+
+def _camera(folder: Path) -> dict[str, Any]:
+    q, columns = images(Arm(0), 25, 0, 0.2)
+    records = write(folder / "board.csv", q, columns)
+    keys = {"mechanism": str(arm_file(folder, frames=True)), **CAMERA}
+    return {"records": str(records), "mechanism": "instrument", "mechanism_keys": keys}
+
+
+def test_pixels_of_a_board_identify_the_arm_its_mounting_and_the_lens(tmp_path: Path) -> None:
+    """The reference is the noise: of two coordinates of 0.2 pixels, on images that were held out whole."""
+    found = identify(**_camera(tmp_path), noise="0.2 px", seed=0)
+    held_out = found.results["test"]["position"]
+    assert 0.9 < held_out["after"] / (math.sqrt(2) * 0.2 * PIXEL) < 1.25
+    assert held_out["before"] > 4 * held_out["after"]
+    machine = found.mechanism()
+    values = dict(zip((p.name for p in machine.geometry), machine.nominal.tolist(), strict=True))
+    for name in ("fx", "fy", "cx", "cy"):
+        assert abs(values[f"camera_{name}"] / PIXEL - LENS[name]) < 3, name
+    assert abs(values["camera_k1"] - LENS["k1"]) < 0.03
+    # New images of the same arm, at other places.
+    q, columns = images(Arm(0), 6, 99, 0.0)
+    rows = torch.from_numpy(np.column_stack([columns["u[px]"], columns["v[px]"]]) * PIXEL)
+    given = torch.from_numpy(np.column_stack([columns[f"board_{a}[m]"] for a in "xyz"]))
+    seen = machine.forward_kinematics(torch.from_numpy(q), guess=torch.cat([rows, given], -1))[:, :2]
+    assert float((seen - rows).norm(dim=-1).square().mean().sqrt()) < 0.6 * PIXEL
+    # Its file is the machine with the camera as found, and nothing of it is fitted anew.
+    found.save(tmp_path / "found")
+    again = load_mechanism(str(tmp_path / "found" / "identified.yaml"))
+    assert isinstance(again, Instrument) and again.unknown_frames == ()
+    torch.testing.assert_close(again.nominal, machine.nominal, rtol=0, atol=1e-12)
+
+
+def test_a_camera_that_stands_sees_a_board_on_the_hand() -> None:
+    """The same images: a camera on the hand that sees a board is a board that sees a camera, the other way round."""
+    arm = load_mechanism("serial", name="one", convention="standard", links=[[0.1, 0.2, 0.3, 0.0]] * 3)
+    lens = {"fx": 800.0, "cx": 500.0, "cy": 400.0, "refine": False}
+    machine = load_mechanism("instrument", mechanism=arm.describe(), kind="camera", on_hand=False, **lens)
+    q = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
+    position, rotation = arm.frame(arm.forward_kinematics(q))
+    corner = np.array([0.02, -0.03, 2.0])
+    x, y, z = rotation.numpy() @ corner + position.numpy()
+    guess = torch.tensor([0.0, 0.0, *corner], dtype=torch.float64)
+    read = machine.forward_kinematics(q, guess=guess)
+    expected = [1e-6 * (800 * x / z + 500), 1e-6 * (800 * y / z + 400)]
+    np.testing.assert_allclose(read[:2].numpy(), expected, rtol=1e-12)
+    np.testing.assert_allclose(read[2:].numpy(), corner)
+    again = mechanism_from_description(machine.describe())
+    torch.testing.assert_close(again.forward_kinematics(q, guess=guess), read, rtol=0, atol=0)
+
+
+def test_commands_from_pixels_bring_the_true_arm_to_its_poses(tmp_path: Path) -> None:
+    """By the model that a run writes, on the true arm: the way from pose to pose, which no frame changes."""
+    keys = {**_camera(tmp_path), "geometry": "identify", "effects": "none", "methods": ["constant"]}
+    found = calibrate(RunConfig.from_keys(**keys))
+    explained = found.results.pose.position.explained
+    assert explained is not None and explained.rms.median is not None
+    assert explained.rms.median < 1.3 * math.sqrt(2) * 0.2 * PIXEL
+    found.save(tmp_path / "model", forms=["safetensors"])
+    # Wanted: where the camera of the true arm is over the board; the command from near by.
+    q = np.unique(images(Arm(0), 12, 5, 0.0)[0], axis=0)
+    wanted = np.array([camera_pose(Arm(0), v) for v in q])
+    near = torch.from_numpy(q + 0.02)
+    machines = (found.mechanism(), load_machine(tmp_path / "model" / "model.safetensors"))
+    commands = [m.solve_inverse(torch.from_numpy(wanted), guess=near).numpy() for m in machines]
+    reached = [np.array([camera_pose(Arm(0), v) for v in command]) for command in commands]
+    before, after = (float(np.sqrt(((r - wanted)[:, :3] ** 2).sum(1).mean())) for r in reached)
+    assert after < 2.5e-4 and after < 0.15 * before
+
+
+def _wire(folder: Path, arm: Arm, q: Array, seed: int) -> Path:
+    number = np.arange(len(q)) % 3
+    tips = np.array([arm.tip(v) for v in q])
+    noise = np.random.default_rng(seed).normal(0, 2e-5, len(q))
+    far = np.linalg.norm(tips - ANCHORS[number], axis=1) + noise
+    return write(folder / "wire.csv", q, {"anchor[1]": number + 1.0, "distance[m]": far})
+
+
+def _level(folder: Path, arm: Arm, q: Array, seed: int) -> Path:
+    up = np.array([arm.flange(v)[0][2, :2] for v in q])
+    tilt = np.arcsin(up) + np.random.default_rng(seed).normal(0, 2e-5, up.shape)
+    return write(folder / "level.csv", q, {"tilt_x[rad]": tilt[:, 0], "tilt_y[rad]": tilt[:, 1]})
+
+
+@pytest.mark.parametrize("kind", ["wire", "level"])
+def test_geometry_that_an_instrument_shows_is_named(tmp_path: Path, kind: str) -> None:
+    """Not every error of it: a level sees no length, and its verdict has none."""
+    arm, q = Arm(3), joints(150, 1)
+    records = {"wire": _wire, "level": _level}[kind](tmp_path, arm, q, 2)
+    keys: dict[str, Any] = {"anchors": 3} if kind == "wire" else {}
+    machine = load_mechanism("instrument", mechanism=str(arm_file(tmp_path, frames=False)), kind=kind, **keys)
+    found = diagnose(load_records(str(records), machine), machine, network=False)
+    assert set(found.verdict["effects"]) <= {"geometry", "joint_offset"} and found.verdict["effects"]
+    assert found.by_block["after"] < 0.05 * found.by_block["before"]
+    geometry = next(e for e in found.effects if e["name"] == "geometry")["parameters"]
+    if kind == "level":
+        lengths = [abs(v["value"]) for n, v in geometry.items() if n[0] in "ad" and not n.startswith("alpha")]
+        assert max(lengths, default=0.0) < 1e-12
+
+
+def test_rows_of_a_gauge_a_level_and_wires_stand_in_one_fit(tmp_path: Path) -> None:
+    """Held to the truth, of the numbers that are said to be identified: 95 % intervals."""
+    arm = Arm(4)
+    files = [_level(tmp_path, arm, joints(80, 5), 6), _wire(tmp_path, arm, joints(80, 7), 8)]
+    pairs = joints(160, 9).reshape(80, 2, 6)
+    far = np.array([np.linalg.norm(arm.tip(a) - arm.tip(b)) for a, b in pairs])
+    names = {f"q{i + 1}_b[rad]": pairs[:, 1, i] for i in range(6)}
+    rows = write(tmp_path / "pairs.csv", pairs[:, 0], {**names, "distance[m]": far})
+    beside = [
+        {"kind": "pose", "records": str(files[0]), "noise": "20 urad", "instrument": {"kind": "level"}},
+        {"kind": "pose", "records": str(files[1]), "noise": "20 um", "instrument": {"kind": "wire", "anchors": 3}},
+    ]
+    found = identify(
+        records=str(rows),
+        mechanism=str(arm_file(tmp_path, frames=False)),
+        constraint={"kind": "distances", "beside": beside},
+        noise="5 um",
+        seed=0,
+    )
+    blocks = found.results["constraint"]["beside"]
+    assert [b["unit"] for b in blocks] == ["rad", "m"]
+    assert all(0.5 < b["after"] / b["noise"] < 1.3 < b["before"] / b["noise"] for b in blocks)
+    truth = {
+        f"{n}{i + 1}": v
+        for n, own in (("a", arm.a), ("alpha", arm.alpha), ("theta", arm.theta))
+        for i, v in enumerate(own)
+    }
+    machine = found.mechanism()
+    values = dict(zip((p.name for p in machine.geometry), machine.nominal.tolist(), strict=True))
+    sds = {n: b["sd"] for n, b in found.results["parameters"].items() if b.get("sd") is not None}
+    judged = [(values[n] - truth[n]) / sds[n] for n in truth if n in sds]
+    assert len(judged) >= 10 and np.mean(np.abs(judged) < 2.5) > 0.85
+
+
+def test_two_arms_that_hold_one_ball_are_one_machine(tmp_path: Path) -> None:
+    """Self-contact: no device, only the joints at which the tools meet."""
+    one, other = Arm(1), Arm(2)
+    base = turn([0.003, -0.004, 3.1]), np.array([-1.0, 0.02, 0.01])
+    rng = np.random.default_rng(0)
+    rows: list[Array] = []
+    while len(rows) < 100:
+        q = np.concatenate([joints(1, int(rng.integers(1 << 30)))[0] for _ in range(2)])
+
+        def gap(v: Array) -> Array:
+            return np.asarray(base[1] + base[0] @ other.tip(v[6:]) - one.tip(v[:6]))
+
+        for _ in range(25):
+            slope = np.stack([(gap(q + 1e-6 * e) - gap(q - 1e-6 * e)) / 2e-6 for e in np.eye(12)], -1)
+            step = np.linalg.pinv(slope) @ gap(q)
+            q = q - step / max(1.0, 2 * float(np.abs(step).max()))
+        if np.linalg.norm(gap(q)) < 1e-9:
+            rows.append(q + rng.normal(0, 1e-5, 12))
+    names = [f"{arm}_q{i + 1}[rad]" for arm in ("first", "second") for i in range(6)]
+    table = np.column_stack([rows, np.zeros((100, 3))])
+    header = ",".join([*names, "x[m]", "y[m]", "z[m]"])
+    np.savetxt(tmp_path / "two.csv", table, delimiter=",", header=header, comments="", fmt="%.10g")
+    keys = {
+        "first": str(arm_file(tmp_path, frames=False)),
+        "second": str(arm_file(tmp_path, False, "second.yaml", "[-1, 0, 0, 0, 0, 3.1]")),
+    }
+    found = identify(records=str(tmp_path / "two.csv"), mechanism="pair", mechanism_keys=keys, seed=0)
+    held_out = found.results["test"]["position"]
+    assert held_out["after"] < 8e-5 and held_out["after"] < 0.02 * held_out["before"]
+
+
+def test_a_second_encoder_shows_the_gear_between(tmp_path: Path) -> None:
+    q = joints(120, 4)
+    wave = 3e-4 * np.cos(4 * q[:, 2]) + np.random.default_rng(1).normal(0, 1e-5, 120)
+    records = write(tmp_path / "second.csv", q, {"q3_second[rad]": q[:, 2] + 0.01 + wave})
+    machine = load_mechanism("instrument", mechanism=str(arm_file(tmp_path, False)), kind="encoder", joint="q3")
+    found = diagnose(load_records(str(records), machine), machine, network=False)
+    assert found.verdict["effects"] == ["transmission"]
+
+
+def test_what_no_instrument_can_be_is_refused(tmp_path: Path) -> None:
+    arm = str(arm_file(tmp_path, frames=False))
+    for keys, said in (
+        ({"kind": "sextant"}, "no instrument 'sextant'; write one of camera, wire, dial, level, encoder"),
+        ({"kind": "wire", "ropes": 2}, "a wire has no key 'ropes'; it has anchors"),
+        ({"kind": "wire", "anchors": 0}, "anchors: 0 is no number of them"),
+        ({"kind": "encoder", "joint": "q9"}, "there is no joint 'q9'; write one of q1, q2"),
+        ({"kind": "level", "link": 9}, "link: 9 is no link of own; write 0 to 6"),
+        ({"kind": "camera", "fx": 900.0}, "camera: .*missing.*cx"),
+        ({"kind": "dial", "normals": [[0, 0, 0]]}, "normals: write a direction"),
+    ):
+        with pytest.raises(InputError, match=said):
+            load_mechanism("instrument", mechanism=arm, **keys)
+    with pytest.raises(InputError, match="has no orientation, which a level on it needs"):
+        load_mechanism("instrument", mechanism="five_bar", kind="level")
+    with pytest.raises(InputError, match="the frames of own are not known"):
+        load_mechanism("pair", first=arm, second=str(arm_file(tmp_path, True, "free.yaml")))
+
+
+def test_images_that_show_too_few_corners_are_refused(tmp_path: Path) -> None:
+    q, columns = images(Arm(0), 10, 0, 0.2)
+    few = np.arange(len(q)) % len(CORNERS) < 3
+    records = write(tmp_path / "few.csv", q[few], {n: v[few] for n, v in columns.items()})
+    keys = {"mechanism": str(arm_file(tmp_path, frames=True)), **CAMERA}
+    with pytest.raises(InputError, match=r"0 of \d+ images show 4 corners or more"):
+        identify(records=str(records), mechanism="instrument", mechanism_keys=keys)
+
+
+def test_a_gauge_reads_heights_over_its_plane() -> None:
+    arm = load_mechanism(
+        "serial", name="one", convention="standard", links=[[0.1, 0.2, 0.3, 0.0]] * 3, tool=[*TOOL, 0, 0, 0]
+    )
+    machine = load_mechanism("instrument", mechanism=arm.describe(), kind="dial", normals=[[0, 0, 2], [1, 0, 0]])
+    q = torch.tensor([[0.3, -0.2, 0.5], [0.1, 0.4, -0.3]], dtype=torch.float64)
+    guess = torch.tensor([[0.0, 1.0], [0.0, 2.0]], dtype=torch.float64)
+    values = machine.nominal.clone()
+    values[-6:] = torch.tensor([0.1, 0.0, 0.0, 0.2, 0.0, 0.0])
+    place = arm.forward_kinematics(q)
+    expected = [float(place[0, 2]) - 0.1, float(place[1, 0]) - 0.2]
+    np.testing.assert_allclose(machine.forward_kinematics(q, values, guess)[:, 0].numpy(), expected, atol=1e-15)
