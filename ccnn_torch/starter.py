@@ -37,7 +37,7 @@ _TURNS = (
     (("w", "p", "r"), EULER_ANGLES["fanuc"][0]),
 )
 # Mechanisms whose number of joints or frames does not follow from headers.
-_OPEN = ("serial", "framed", "partial")
+_OPEN = ("serial", "framed", "partial", "machine")
 
 
 @dataclass(frozen=True)

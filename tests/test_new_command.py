@@ -145,5 +145,5 @@ def test_tables_without_joints_or_with_strange_text(tmp_path: Path) -> None:
 
 
 def test_completion_knows_the_mechanisms() -> None:
-    assert set(MECHANISMS) == set(REGISTRY) - {"serial", "framed", "partial"}
+    assert set(MECHANISMS) == set(REGISTRY) - {"serial", "framed", "partial", "machine"}
     assert complete_mechanism("del") == ["delta", "delta_linear"]

@@ -155,8 +155,9 @@ class Geometry(Effect):
         """One a parameter."""
         mechanism = situation.mechanism
         chosen = caused_by(mechanism, self.name)
-        # The parameters of an arm's link i come after its joint i.
-        links = len(chosen) // len(mechanism.joints) if isinstance(mechanism, SerialArm) else 0
+        # The parameters of an arm's link i come after its joint i; those with words of their own need no link.
+        linked = isinstance(mechanism, SerialArm) and not any(mechanism.geometry[k].word for k in chosen)
+        links = len(chosen) // len(mechanism.joints) if linked else 0
         return tuple(
             Coefficient(
                 mechanism.geometry[k].name,

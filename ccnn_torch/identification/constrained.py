@@ -47,6 +47,7 @@ from ccnn_torch.records.load import read_source
 _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
 # Prior of the tool's offset around its first fit, and of a plate's extent around what its records say [m].
 _TOOL_TOLERANCE, _PLATE_TOLERANCE = 0.05, 1e-4
+_LINK_TOLERANCE = {"m": 1e-3, "rad": 1e-2}
 
 Build = Callable[[ParameterChoice, Tensor, float | None], Problem]
 
@@ -241,12 +242,12 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
     about = config.constraint
     assert about is not None
     given, key = about.tolerance, "constraint.tolerance"
-    one = 0.01 if isinstance(given, dict) else size(given, None, key)
     links = [p for p in mechanism.geometry if p.name in free and not p.name.startswith("tool_")]
-    # The default is for lengths and angles, whichever of them there are.
-    others = {"m", "rad"} - {p.unit for p in links}
-    named = {name: v for name, v in given.items() if name not in others} if isinstance(given, dict) else {}
-    values = sizes_by_name(named, links, key, [one] * len(links)).tolist()
+    if given is None or isinstance(given, dict):
+        usual = [p.scale or _LINK_TOLERANCE.get(p.unit, 0.01) for p in links]
+        values = sizes_by_name(given or {}, links, key, usual).tolist()
+    else:
+        values = [size(given, None, key)] * len(links)
     if any(not v > 0 for v in values):
         raise InputError(
             f"{key}: {min(values):g} is no standard deviation; write a size above 0, or fix the parameters"

@@ -7,8 +7,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.display import count_text, display_unit, number_text, own_unit
 from ccnn_torch.identification.judge import figure_text
+from ccnn_torch.identification.klipper import printer_table
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.json_files import read_json
@@ -106,6 +107,7 @@ def identified_tables(results: Block) -> list[Table]:
     """All tables, in reading order."""
     tables = [
         _parameter_table(results),
+        printer_table(results),
         _method_table(results),
         _deviation_table(results),
         _transfer_table(results),
@@ -165,14 +167,22 @@ def _shown_units(blocks: Sequence[Block]) -> dict[str, tuple[float, str]]:
 def _parameter_table(results: Block) -> Table:
     free = {name: block for name, block in results["parameters"].items() if block["free"]}
     lost = "not identifiable" if results["methods"][results["method"]]["converged"] else "–"
-    units = _shown_units([*free.values()])
+    plain = [block for block in free.values() if not own_unit(block)]
+    units = _shown_units(plain)
+
+    def unit(block: Block) -> tuple[float, str]:
+        return own_unit(block) or units[block["unit"]]
 
     def column(cell: Callable[[Block, float], str]) -> list[str]:
-        return [cell(block, units[block["unit"]][0]) for block in free.values()]
+        return [cell(block, unit(block)[0]) for block in free.values()]
+
+    def nominal(block: Block, _: float) -> str:
+        scale, shown = own_unit(block) or (1.0, block["unit"])
+        return f"{number_text(block['nominal'] / scale, 6)} {shown}".removesuffix(" 1")
 
     columns = {
-        "parameter": [f"{name} [{units[block['unit']][1]}]" for name, block in free.items()],
-        "nominal": column(lambda p, _: f"{number_text(p['nominal'], 6)} {p['unit']}".removesuffix(" 1")),
+        "parameter": [f"{block.get('word') or name} [{unit(block)[1]}]" for name, block in free.items()],
+        "nominal": column(nominal),
     }
     if results["simulated"]:
         columns["|true - nominal|"] = column(lambda p, scale: figure_text(p, "error_before", scale))
@@ -318,10 +328,14 @@ def _rows(results: Block) -> Iterator[Row]:
                 low, high = block.get("spread", {}).get(key, (None, None))
                 yield subject, name, prefix + key, unit, block[key], low, high
 
+    keys: tuple[str, ...] = ("nominal", "value", "sd", "true", "error_before", "deviation")
     for name, block in results["parameters"].items():
-        yield from of(
-            "parameter", name, block, block["unit"], ("nominal", "value", "sd", "true", "error_before", "deviation")
-        )
+        yield from of("parameter", name, block, block["unit"], keys)
+    for block in results["parameters"].values():
+        # Of the words alone the numbers that are told: the interval over machines is above.
+        if own := own_unit(block):
+            told = {key: None if block[key] is None else block[key] / own[0] for key in keys if key in block}
+            yield from of("number", block["word"], told, block["shown"], keys)
     for method, block in results["methods"].items():
         for part in ("position", "rotation"):
             test = block["test"][part]

@@ -24,7 +24,7 @@ class ParameterChoice:
     A pattern is a name with `*`, `?` or `[…]` (`A*`, `tool_?`), or `leg1.PATTERN`: those of leg 1 that match.
 
     Attributes:
-        free: what is identified; everything when None.
+        free: what is identified; everything that is not held when None.
         fixed: what is left at its start, also where `free` names it.
         tied: groups that share one value; a group is a list of names and patterns, or one pattern.
         prior: standard deviation of a Gaussian prior around the start, by name or pattern [SI].
@@ -91,7 +91,11 @@ def select_parameters(
     names = [g.name for g in geometry]
     nominal = torch.tensor([g.nominal for g in geometry], dtype=torch.float64)
     whole = (nominal if start is None else start.detach()).reshape(-1, len(names))
-    free = set(names) if choice.free is None else match_parameters(geometry, choice.free, "free")
+    free = (
+        {g.name for g in geometry if not g.held}
+        if choice.free is None
+        else match_parameters(geometry, choice.free, "free")
+    )
     free -= match_parameters(geometry, choice.fixed, "fixed")
     if not free:
         raise InputError("parameters: nothing is left free; name at least one in free, or fix fewer")
