@@ -52,6 +52,7 @@ class Parameter:
             its name and an SI unit do. An angle may be told as a slope.
         held: whether it stays at its nominal value unless a config names it free: it is exact, or another one stands
             for it.
+        tied: parameters with one such text share one value unless a config ties others; empty = alone.
         same_as: effect and coefficient, ``joint_gain q1``, that do the very same and go by the same word.
     """
 
@@ -67,6 +68,7 @@ class Parameter:
     word: str = ""
     shown: str = ""
     held: bool = False
+    tied: str = ""
     same_as: str = ""
 
 

@@ -355,7 +355,7 @@ def _known(fit: ConstraintFit) -> Known:
 def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
     """A sentence on the parameters that the rows determine no better than their priors."""
     determined = zip(fit.selection.parameters, known.sd[0], fit.knowledge.identifiable[0], strict=False)
-    prior = [p.name for p, sd, seen in determined if bool(seen) and not math.isfinite(sd)]
+    prior = [p.word or p.name for p, sd, seen in determined if bool(seen) and not math.isfinite(sd)]
     return [f"No better known than by the tolerance given: {', '.join(prior)}."] if prior else []
 
 

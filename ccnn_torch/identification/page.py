@@ -86,8 +86,8 @@ def identified_verdict(results: Block) -> str:
     if results["methods"][method]["converged"] == 0:
         return f"{failed} Its error on {rows}{machines}: {', '.join(parts)}."
     text = f"{failed} {text}".lstrip() + ", ".join(parts)
-    free = [p for p in results["parameters"].values() if p["free"]]
-    lost = sum(not p["identifiable"] for p in free)
+    free = _free(results)
+    lost = sum(not p["identifiable"] for p in free.values())
     text += f"; {len(free) - lost} of {len(free)} parameters are identified"
     return text + (f", {lost} are not determined by these rows." if lost else ".")
 
@@ -164,8 +164,13 @@ def _shown_units(blocks: Sequence[Block]) -> dict[str, tuple[float, str]]:
     return units
 
 
+def _free(results: Block) -> dict[str, Block]:
+    """What was identified, by the name that people use; parameters of one word are one number."""
+    return {block.get("word") or name: block for name, block in results["parameters"].items() if block["free"]}
+
+
 def _parameter_table(results: Block) -> Table:
-    free = {name: block for name, block in results["parameters"].items() if block["free"]}
+    free = _free(results)
     lost = "not identifiable" if results["methods"][results["method"]]["converged"] else "–"
     plain = [block for block in free.values() if not own_unit(block)]
     units = _shown_units(plain)
@@ -181,7 +186,7 @@ def _parameter_table(results: Block) -> Table:
         return f"{number_text(block['nominal'] / scale, 6)} {shown}".removesuffix(" 1")
 
     columns = {
-        "parameter": [f"{block.get('word') or name} [{unit(block)[1]}]" for name, block in free.items()],
+        "parameter": [f"{name} [{unit(block)[1]}]" for name, block in free.items()],
         "nominal": column(nominal),
     }
     if results["simulated"]:
@@ -331,8 +336,8 @@ def _rows(results: Block) -> Iterator[Row]:
     keys: tuple[str, ...] = ("nominal", "value", "sd", "true", "error_before", "deviation")
     for name, block in results["parameters"].items():
         yield from of("parameter", name, block, block["unit"], keys)
-    for block in results["parameters"].values():
-        # Of the words alone the numbers that are told: the interval over machines is above.
+    # Parameters of one word are one number; intervals over machines are above.
+    for block in {block.get("word"): block for block in results["parameters"].values()}.values():
         if own := own_unit(block):
             told = {key: None if block[key] is None else block[key] / own[0] for key in keys if key in block}
             yield from of("number", block["word"], told, block["shown"], keys)

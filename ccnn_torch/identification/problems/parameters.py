@@ -26,7 +26,8 @@ class ParameterChoice:
     Attributes:
         free: what is identified; everything that is not held when None.
         fixed: what is left at its start, also where `free` names it.
-        tied: groups that share one value; a group is a list of names and patterns, or one pattern.
+        tied: groups that share one value; a group is a list of names and patterns, or one pattern. Those of the
+            mechanism's own where there are none.
         prior: standard deviation of a Gaussian prior around the start, by name or pattern [SI].
     """
 
@@ -99,6 +100,9 @@ def select_parameters(
     free -= match_parameters(geometry, choice.fixed, "fixed")
     if not free:
         raise InputError("parameters: nothing is left free; name at least one in free, or fix fewer")
+    if not choice.tied:
+        own = {g.tied: [other.name for other in geometry if other.tied == g.tied] for g in geometry if g.tied}
+        choice = dataclasses.replace(choice, tied=[group for group in own.values() if free.issuperset(group)])
     groups = _groups(geometry, choice, free, whole)
     spread = torch.zeros(len(groups), len(names), dtype=torch.float64, device=whole.device)
     for row, group in enumerate(groups):

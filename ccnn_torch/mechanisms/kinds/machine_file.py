@@ -144,13 +144,16 @@ def _parallel(
         each = entry["each"]
         unit = geometry[places[each[0]]].unit
         same = entry.get("same_as", [""] * len(each))
+        # One number for all legs, unless the file has one for each.
+        one = key if entry.get("one") and not isinstance(given.get(key), list) else ""
         for parameter, number, label, alike in zip(
             each, _numbers(key, entry, given, unit, len(each), where), about["names"], same, strict=True
         ):
             i = places[parameter]
             value = geometry[i].nominal if number.value is None else number.value
             told = _told(entry, key, number, alike)
-            geometry[i] = replace(geometry[i], nominal=value, **{**told, "word": f"{told['word']}{label}"})
+            told["word"] += "" if one else label
+            geometry[i] = replace(geometry[i], nominal=value, tied=one, **told)
             mechanism.nominal[i] = value
     mechanism.geometry = tuple(geometry)
     mechanism.name = content["machine"]
@@ -164,7 +167,8 @@ def _told(entry: Mapping[str, Any], key: str, number: _Number, alike: str) -> di
     """Fields of a `Parameter` that say how it is told and how well it is known."""
     word = entry.get("word", key.replace("_", " "))
     # An exact number has the scale of its kind all the same, where a config sets it free.
-    scale = number.tolerance or _amount(entry["tolerance"], None, key) or None
+    usual = entry["tolerance"][0] if isinstance(entry["tolerance"], list) else entry["tolerance"]
+    scale = number.tolerance or _amount(usual, None, key) or None
     return {"word": word, "shown": number.shown, "scale": scale, "held": number.tolerance == 0, "same_as": alike}
 
 
@@ -187,15 +191,17 @@ def _numbers(
     texts = texts if isinstance(texts, list) else [texts] * count
     if len(texts) != count:
         raise InputError(f"{where}: numbers.{key}: needs one value, or a list of {count}, not {len(texts)}")
+    usual = entry.get("tolerance", 0)
+    usual = usual if isinstance(usual, list) else [usual] * count
     found = []
-    for text in texts:
+    for text, own in zip(texts, usual, strict=True):
         value, *tolerance = _TOLERANCE.split(str(text)) if text is not None else [None]
         if len(tolerance) > 1:
             raise InputError(
                 f"{where}: numbers.{key}: '{visible(str(text))}' has two tolerances; write 250 mm +- 0.5 mm"
             )
         about = f"{where}: numbers.{key}"
-        spread = _amount(tolerance[0] if tolerance else entry.get("tolerance", 0), unit, about)
+        spread = _amount(tolerance[0] if tolerance else own, unit, about)
         if not 0 <= spread <= LARGEST:
             raise InputError(f"{about}: the tolerance {visible(str(tolerance[0]))} is none; write 0 or more after +-")
         found.append(_Number(None if value is None else _amount(value, unit, about), spread, _shown(entry)))
@@ -262,5 +268,6 @@ def template(kind: str) -> str:
 
 def _written(value: Any, tolerance: Any = None) -> str:
     if isinstance(value, list):
-        return f"[{', '.join(_written(v, tolerance) for v in value)}]"
+        each = tolerance if isinstance(tolerance, list) else [tolerance] * len(value)
+        return f"[{', '.join(map(_written, value, each))}]"
     return str(value) if tolerance is None else f"{value} +- {tolerance}"

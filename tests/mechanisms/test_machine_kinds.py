@@ -101,6 +101,7 @@ def test_a_delta_printer_has_a_value_for_each_tower(tmp_path: Path) -> None:
     assert [by_name[f"rod{i}"].nominal for i in (1, 2, 3)] == pytest.approx([0.2504, 0.25, 0.2498])
     assert by_name["rod1"].word == "rod A" and by_name["rod1"].shown == "mm"
     assert by_name["rod1"].scale == pytest.approx(5e-5) and by_name["rod2"].scale == pytest.approx(5e-4)
+    assert {by_name[f"base{i}"].tied for i in (1, 2, 3)} == {"delta_radius"} and by_name["angle3"].held
     assert by_name["lean2"].scale == pytest.approx(2e-4) and by_name["platform1"].held
     assert made.nominal[[p.name for p in made.geometry].index("rod1")] == pytest.approx(0.2504)
 
@@ -126,6 +127,6 @@ def test_a_delta_printer_has_a_value_for_each_tower(tmp_path: Path) -> None:
 def test_what_is_wrong_in_a_machine_file_is_one_sentence(line: str, said: str, tmp_path: Path) -> None:
     path = tmp_path / "wrong.yaml"
     path.write_text(line)
-    with pytest.raises(InputError, match="wrong.yaml") as error:
+    with pytest.raises(InputError, match=r"wrong\.yaml") as error:
         load_mechanism(str(path))
     assert said in str(error.value) and "\n" not in str(error.value)
