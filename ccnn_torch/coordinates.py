@@ -48,6 +48,12 @@ class Parameter:
         cause: name of its error in a diagnosis; the parameters of one cause are one candidate. None =
             ``geometry``, the lengths and angles of the machine as built.
         sense: which way it counts, where that is not the usual one (``clockwise``).
+        word, shown: what people call it (``squareness xy``), and the unit that they tell it in (``um/m``); empty where
+            its name and an SI unit do. An angle may be told as a slope.
+        held: whether it stays at its nominal value unless a config names it free: it is exact, or another one stands
+            for it.
+        tied: parameters with one such text share one value unless a config ties others; empty = alone.
+        same_as: effect and coefficient, ``joint_gain q1``, that do the very same and go by the same word.
     """
 
     name: str
@@ -59,6 +65,11 @@ class Parameter:
     high: float | None = None
     cause: str | None = None
     sense: str = ""
+    word: str = ""
+    shown: str = ""
+    held: bool = False
+    tied: str = ""
+    same_as: str = ""
 
 
 _PLAUSIBLE = {"m": 1e-3, "rad": 2e-3, "1": 2e-3}

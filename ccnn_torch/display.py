@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import PurePath
+from typing import Any
+
+from ccnn_torch.units import told_in
 
 # All but letters, digits and signs that open, close or continue nothing in C, Structured Text, HAL, CSV and Markdown;
 # `*` and `/` stand within a unit, and no sign at the beginning makes a formula of a cell or a request of a manual page.
@@ -40,6 +43,22 @@ def unit_text(unit: str) -> str:
     """A unit as in print: `rad/N/m` and `rad/(N*m)` are both `rad/(N·m)`."""
     over, *under = unit.replace("(", "").replace(")", "").replace("*", "·").split("/")
     return f"{over}/{f'({below})' if '·' in (below := '·'.join(under)) else below}" if under else over
+
+
+_PRINTED = {"arcsec": '"', "arcmin": "'", "deg": "°"}
+
+
+def own_unit(block: Mapping[str, Any]) -> tuple[float, str] | None:
+    """What one of the unit is in SI that people tell a number in, and that unit as in print; None where it has none.
+
+    Args:
+        block: with its SI `unit` and the unit that is `shown`.
+    """
+    shown = block.get("shown")
+    if not shown:
+        return None
+    text = _PRINTED.get(shown, shown)
+    return told_in(shown, block["unit"]), f"µ{text[1:]}" if text.startswith("um") else unit_text(text)
 
 
 def number_text(value: float | None, digits: int = 4) -> str:

@@ -40,7 +40,7 @@ _TURNS = (
 # How others call the coordinates of a commanded pose, before or after the coordinate.
 _GOALS = ("goal", "commanded", "command", "cmd", "target", "soll")
 # Mechanisms whose number of joints or frames does not follow from headers.
-_OPEN = ("serial", "framed", "partial", "instrument", "pair")
+_OPEN = ("serial", "framed", "partial", "instrument", "pair", "machine")
 
 
 @dataclass(frozen=True)

@@ -211,6 +211,32 @@ def to_si(
     return np.asarray(_registry().Quantity(array, _lookup(unit).pint_name).to_base_units().magnitude, dtype=np.float64)
 
 
+_WITH_UNIT = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?inf|nan)\s*(?P<unit>.*)", re.IGNORECASE)
+_WRITTEN = {"m": "0.4 mm", "rad": "0.03 deg", "1": "0.002"}
+
+
+def amount(text: str, si_unit: str | None, where: str) -> float:
+    """The number of a text such as `0.4 mm` in SI; without a unit it is in SI, and si_unit None takes any unit.
+
+    Raises:
+        InputError: it is no number with a unit, or of another dimension; `where` opens the sentence.
+    """
+    match = _WITH_UNIT.fullmatch(text.strip())
+    if match is None:
+        raise InputError(f"{where}: '{text}' is no number with a unit; write e.g. 0.4 mm, or a number in SI")
+    number = float(match["number"])
+    if not match["unit"]:
+        return number
+    hint = f"write e.g. {_WRITTEN.get(si_unit or '', 'a number')}, or a number in SI"
+    return float(to_si(number, match["unit"], si_unit, where, hint=hint))
+
+
+def told_in(unit: str, si_unit: str) -> float:
+    """What one of a unit is in SI, that of a parameter; an angle may be told as a slope, `um/m`."""
+    slope = si_unit == "rad" and si_unit_of(unit) == "1"
+    return float(to_si(1.0, unit, "1" if slope else si_unit, unit))
+
+
 def from_si(values: ArrayLike, si_unit: str, unit: str) -> NDArray[np.float64]:
     """Inverse of `to_si`. values: any shape, in `si_unit`; returns the same shape in `unit`."""
     array = np.asarray(values, dtype=np.float64)

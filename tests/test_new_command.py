@@ -144,6 +144,21 @@ def test_tables_without_joints_or_with_strange_text(tmp_path: Path) -> None:
     assert config.out is None and config.mechanism == "five_bar"
 
 
+def test_a_machine_file_is_written_without_records(tmp_path: Path, cli: Callable[..., tuple[int, str, str]]) -> None:
+    out = tmp_path / "printer.yaml"
+    code, said, _ = cli("new", "--mechanism", "delta_printer", "--out", out)
+    assert code == 0 and f"mechanism={out}" in said
+    assert load_mechanism(str(out)).name == "delta_printer"
+    for words, wanted in (
+        (("--mechanism", "delta_printer", "--out", out), "is there already"),
+        (("--mechanism", "delta_printr", "--out", tmp_path / "other.yaml"), "did you mean 'delta_printer'"),
+        (("--out", tmp_path / "other.yaml"), "give RECORDS.csv, or --mechanism KIND"),
+        ((tmp_path / "rows.csv",), "--out: name the config"),
+    ):
+        code, _, told = cli("new", *words)
+        assert code == 2 and wanted in told
+
+
 def test_completion_knows_the_mechanisms() -> None:
-    assert set(MECHANISMS) == set(REGISTRY) - {"serial", "framed", "partial", "instrument", "pair"}
+    assert set(MECHANISMS) == set(REGISTRY) - {"serial", "framed", "partial", "instrument", "pair", "machine"}
     assert complete_mechanism("del") == ["delta", "delta_linear"]

@@ -35,32 +35,51 @@ if TYPE_CHECKING:
 
 
 def new(
-    records: Annotated[Path, typer.Argument(metavar="RECORDS.csv", help="Measured rows, with a line of headers.")],
-    out: Annotated[Path, typer.Option(metavar="CONFIG.yaml", help="The config to write.")],
+    records: Annotated[
+        Path | None, typer.Argument(metavar="RECORDS.csv", help="Measured rows, with a line of headers.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE.yaml", help="The config or machine file to write.")] = None,
     mechanism: Mechanism = None,
     units: Annotated[
         str | None, typer.Option(metavar="LENGTH,ANGLE", help="Units of columns without one, e.g. mm,deg.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing CONFIG.yaml.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing FILE.yaml.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a config for ccnn run from a table of measurements, with comments on what was guessed.
+    """Write a config for ccnn run from a table of measurements, or without one a machine file of a kind of machine.
 
     Joints may be called q1, J1, A1, joint_1, axis1 …; the position X, Y, Z; the orientation rx, ry, rz, qw to qz, A, B,
     C (KUKA) or W, P, R (Fanuc). What cannot be guessed is asked for on a terminal; elsewhere, and with
     --quiet, a message names it.
+
+    A machine file asks for the numbers that people know of a machine; the kinds are gantry, linear_axis, scara,
+    five_axis_table_table, five_axis_table_head, five_axis_head_head, delta_printer, hexapod, alt_azimuth, pan_tilt.
 
     Examples:
 
     ccnn new measured.csv --out robot.yaml
 
     ccnn new measured.csv --mechanism my_arm.yaml --units mm,deg --out robot.yaml
+
+    ccnn new --mechanism delta_printer --out printer.yaml
     """
+    if records is None:
+        if mechanism is None:
+            raise InputError("give RECORDS.csv, or --mechanism KIND for a machine file, e.g. --mechanism gantry")
+        out = Path(f"{mechanism}.yaml") if out is None else out
+    if out is None:
+        raise InputError("--out: name the config to write, e.g. --out robot.yaml")
     if out.exists() and not force:
         raise InputError(f"{out} is there already; name another file, or give --force to overwrite it")
     from ccnn_torch.files.write import write_whole
+    from ccnn_torch.mechanisms.kinds.machine_file import template
     from ccnn_torch.starter import starter_config
 
+    if records is None:
+        write_whole(out, template(str(mechanism)).encode())
+        if not quiet:
+            typer.echo(f"{out} is written. Write your machine's numbers into it, then use it as mechanism={out}")
+        return
     asks = not quiet and sys.stdin is not None and sys.stdin.isatty()
     ask = (lambda question: str(typer.prompt(question, default="", show_default=False))) if asks else None
     text, ready = starter_config(records, out, mechanism, units, ask)

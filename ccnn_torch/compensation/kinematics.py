@@ -263,6 +263,7 @@ class Links(nn.Module):
     _shifts: Tensor
     _slides: Tensor
     _turns: Tensor
+    _coupled: Tensor | None
 
     def __init__(self, arm: Mechanism) -> None:
         super().__init__()
@@ -276,11 +277,13 @@ class Links(nn.Module):
             "_shifts": shifts,
             "_slides": (~arm.revolute).to(torch.float64),
             "_turns": arm.revolute.to(torch.float64),
+            "_coupled": arm.coupled(arm.nominal),
         }.items():
             self.register_buffer(name, value, persistent=False)
 
     def at(self, joints: Tensor) -> Placed:
         """At joints `... x n` [SI]."""
+        joints = joints if self._coupled is None else joints @ self._coupled.mT
         turned, other = torch.cos(joints) * self._turns, torch.sin(joints) * self._turns + joints * self._slides
         moved = turned[..., None, None] * self._links[0] + other[..., None, None] * self._links[1] + self._links[2]
         chain = [moved[..., 0, :, :]]
@@ -291,6 +294,8 @@ class Links(nn.Module):
         spins = (rotations @ self._spins)[..., 0]
         linear = (rotations @ self._shifts)[..., 0] + cross(spins, lever)
         rotation = chain[-1][..., :3, :3] if self._turned else None
+        if self._coupled is not None:
+            linear, spins = self._coupled.mT @ linear, self._coupled.mT @ spins
         return Placed(chain[-1][..., :3, 3], rotation, linear, spins)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 
@@ -13,14 +12,12 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.spelling import nearest
-from ccnn_torch.units import to_si
+from ccnn_torch.units import amount
 
 ANGLE_ARM = 0.3
 """Distance of the points that determine orientation [m]: the noise of an angle is that of a length over this."""
 
 Size = float | str
-_WITH_UNIT = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?inf|nan)\s*(?P<unit>.*)", re.IGNORECASE)
-_WRITTEN = {"m": "0.4 mm", "rad": "0.03 deg", "1": "0.002"}
 
 
 def size(value: Size, unit: str | None, key: str) -> float:
@@ -29,16 +26,7 @@ def size(value: Size, unit: str | None, key: str) -> float:
     Raises:
         InputError: a text that is no number with a unit, or a unit of another dimension; names the key.
     """
-    if isinstance(value, int | float):
-        return float(value)
-    match = _WITH_UNIT.fullmatch(value.strip())
-    if match is None:
-        raise InputError(f"{key}: '{value}' is no number with a unit; write e.g. 0.4 mm, or a number in SI")
-    amount = float(match["number"])
-    if not match["unit"]:
-        return amount
-    hint = f"write e.g. {_WRITTEN.get(unit or '', 'a number')}, or a number in SI"
-    return float(to_si(amount, match["unit"], unit, key, hint=hint))
+    return float(value) if isinstance(value, int | float) else amount(value, unit, key)
 
 
 def sizes_by_name(

@@ -119,7 +119,9 @@ def on_fitted_frames(situation: Situation) -> Situation:
 def loose_parameters(mechanism: Mechanism, identify: bool) -> list[int]:
     """Numbers of the parameters that are fitted beside effects: all of them, or those of unknown frames."""
     unknown = getattr(mechanism, "unknown_frames", ())
-    return [k for k, g in enumerate(mechanism.geometry) if identify or g.name.partition("_")[0] in unknown]
+    return [
+        k for k, g in enumerate(mechanism.geometry) if (identify and not g.held) or g.name.partition("_")[0] in unknown
+    ]
 
 
 class _Model:

@@ -75,7 +75,8 @@ def own_parameters(mechanism: Mechanism) -> list[int]:
 
 def caused_by(mechanism: Mechanism, cause: str) -> list[int]:
     """Numbers of the mechanism's own parameters that are wrong by this cause, ``geometry`` where they name none."""
-    return [k for k in own_parameters(mechanism) if (mechanism.geometry[k].cause or "geometry") == cause]
+    own = ((k, mechanism.geometry[k]) for k in own_parameters(mechanism))
+    return [k for k, p in own if (p.cause or "geometry") == cause and not p.held]
 
 
 def parameter_columns(situation: Situation, cause: str) -> Tensor:

@@ -163,9 +163,10 @@ class Geometry(Effect):
         """One a parameter."""
         mechanism = situation.mechanism
         chosen = caused_by(mechanism, self.name)
-        # The parameters of an arm's link i come after its joint i.
+        # The parameters of an arm's link i come after its joint i; those with words of their own need no link.
         of_links = isinstance(inside(mechanism), SerialArm) and self.name == "geometry"
-        links = len(chosen) // len(mechanism.joints) if of_links else 0
+        linked = of_links and not any(mechanism.geometry[k].word for k in chosen)
+        links = len(chosen) // len(mechanism.joints) if linked else 0
         return tuple(
             Coefficient(
                 mechanism.geometry[k].name,

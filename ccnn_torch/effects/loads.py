@@ -34,7 +34,9 @@ def members(mechanism: Mechanism) -> list[Member]:
         if parameter.unit != "m":
             continue
         name, leg, joint = parameter.name, None, None
-        if isinstance(mechanism, SerialArm):
+        if parameter.word:
+            name = parameter.word
+        elif isinstance(mechanism, SerialArm):
             i = place * len(mechanism.joints) // len(own)
             name, joint = f"link {i + 1}", mechanism.joints[i].name
         elif parameter.leg is not None:

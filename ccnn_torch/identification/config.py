@@ -26,7 +26,6 @@ PER_LEG = "_per_leg"
 
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
-_LINK_TOLERANCE: dict[str, Size] = {"m": 1e-3, "rad": 1e-2}
 
 
 class FrameConfig(Section):
@@ -67,10 +66,11 @@ class ConstraintConfig(Section):
         min_length=1,
         description="columns whose values number the placement, anchor or plane; default placement, anchor or plane",
     )
-    tolerance: Size | dict[str, Size] = Field(
-        default=_LINK_TOLERANCE,
+    tolerance: Size | dict[str, Size] | None = Field(
+        default=None,
         description="prior standard deviation of the links' parameters, by name, pattern or unit, e.g. {m: 1 mm, "
-        "rad: 0.1 deg}, or one number in m and rad alike",
+        "rad: 0.1 deg}, or one number in m and rad alike; null, or of what is not named: as in the machine file, else "
+        "1 mm and 10 mrad",
     )
     plate_tolerance: Size | None = Field(
         default=None,

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.config.split import Given, held_out_notes
-from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import (
     Fit,
@@ -50,6 +49,7 @@ from ccnn_torch.records.load import read_source
 _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
 # Prior of the tool's offset around its first fit, and of a plate's extent around what its records say [m].
 _TOOL_TOLERANCE, _PLATE_TOLERANCE = 0.05, 1e-4
+_LINK_TOLERANCE = {"m": 1e-3, "rad": 1e-2}
 
 Build = Callable[[ParameterChoice, Tensor, float | None], Problem]
 
@@ -282,20 +282,18 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
     about = config.constraint
     assert about is not None
     given, key = about.tolerance, "constraint.tolerance"
-    one = 0.01 if isinstance(given, dict) else size(given, None, key)
     unknown = mechanism.unknown_frames if isinstance(mechanism, Instrument) else ()
-    there = [p for p in mechanism.geometry if p.name in free and p.name.partition("_")[0] not in ("tool", *unknown)]
-    links = [p for p in there if p.cause is None]
-    # The default is for lengths and angles, whichever of them there are.
-    others = {"m", "rad"} - {p.unit for p in links}
-    named = {name: v for name, v in given.items() if name not in others} if isinstance(given, dict) else {}
-    values = sizes_by_name(named, links, key, [one] * len(links)).tolist()
+    links = [p for p in mechanism.geometry if p.name in free and p.name.partition("_")[0] not in ("tool", *unknown)]
+    if given is None or isinstance(given, dict):
+        usual = [p.scale or _LINK_TOLERANCE.get(p.unit, 0.01) for p in links]
+        values = sizes_by_name(given or {}, links, key, usual).tolist()
+    else:
+        values = [size(given, None, key)] * len(links)
     if any(not v > 0 for v in values):
         raise InputError(
             f"{key}: {min(values):g} is no standard deviation; write a size above 0, or fix the parameters"
         )
     priors = {p.name: v for p, v in zip(links, values, strict=True)}
-    priors |= {p.name: plausible_error(p) for p in there if p.cause is not None}
     return priors | {n: _TOOL_TOLERANCE for n in free if n.startswith("tool_") and "tool" not in unknown}
 
 
@@ -401,7 +399,7 @@ def _known(fit: ConstraintFit) -> Known:
 def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
     """A sentence on the parameters that the rows determine no better than their priors."""
     determined = zip(fit.selection.parameters, known.sd[0], fit.knowledge.identifiable[0], strict=False)
-    prior = [p.name for p, sd, seen in determined if bool(seen) and not math.isfinite(sd)]
+    prior = [p.word or p.name for p, sd, seen in determined if bool(seen) and not math.isfinite(sd)]
     return [f"No better known than by the tolerance given: {', '.join(prior)}."] if prior else []
 
 

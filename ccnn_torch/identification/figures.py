@@ -123,7 +123,7 @@ def deviation_plots(results: Results, arrays: Arrays) -> list[Plot]:
         axes.set_xticks(range(len(at)), [free[i][0] for i in at], rotation=60, ha="right")
         axes.set_ylabel(f"|identified - true| [{shown}]")
         figure.legend(loc="outside upper center", ncols=min(len(methods) + 1, 7))
-        kind = {"m": "lengths", "rad": "angles", "1": "gains"}.get(unit, unit)
+        kind = {"m": "lengths", "rad": "angles", "1": "gains"}.get(unit, "couplings")
         plots.append(
             Plot(
                 f"deviations_{kind}",
@@ -228,7 +228,7 @@ def parameter_plot(results: Results, arrays: Arrays) -> Plot | None:
         if truth is not None:
             axes.plot((truth - start)[at] / scale, y, "|", color="#222222", markersize=9, label="true")
         axes.axvline(0, color="#777777", linewidth=0.8)
-        axes.set_yticks(y, names)
+        axes.set_yticks(y, [free[n].get("word") or n for n in names])
         axes.set_ylim(len(names) - 0.4, -0.6)
         axes.set_xlabel(f"difference from nominal [{shown}]")
     handles, labels = grid[0].get_legend_handles_labels()

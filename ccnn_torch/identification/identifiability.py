@@ -42,7 +42,7 @@ def combinations_in_words(parameters: Sequence[Parameter], hidden: Tensor, scale
         members = np.flatnonzero((group == number) & part).tolist()
         if len(members):
             visible = _visible(projector[np.ix_(members, members)]) / sizes[members]
-            sentences.append(_sentence([parameters[i].name for i in members], visible))
+            sentences.append(_sentence([parameters[i].word or parameters[i].name for i in members], visible))
     return tuple(sentences)
 
 

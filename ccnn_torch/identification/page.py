@@ -7,8 +7,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.display import count_text, display_unit, number_text, own_unit
 from ccnn_torch.identification.judge import figure_text
+from ccnn_torch.identification.klipper import printer_table
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.json_files import read_json
@@ -87,8 +88,8 @@ def identified_verdict(results: Block) -> str:
     if results["methods"][method]["converged"] == 0:
         return f"{failed} Its error on {rows}{machines}: {', '.join(parts)}."
     text = f"{failed} {text}".lstrip() + ", ".join(parts)
-    free = [p for p in results["parameters"].values() if p["free"]]
-    lost = sum(not p["identifiable"] for p in free)
+    free = _free(results)
+    lost = sum(not p["identifiable"] for p in free.values())
     text += f"; {len(free) - lost} of {len(free)} parameters are identified"
     return text + (f", {lost} are not determined by these rows." if lost else ".")
 
@@ -108,6 +109,7 @@ def identified_tables(results: Block) -> list[Table]:
     """All tables, in reading order."""
     tables = [
         _parameter_table(results),
+        printer_table(results),
         _method_table(results),
         _deviation_table(results),
         _transfer_table(results),
@@ -164,17 +166,30 @@ def _shown_units(blocks: Sequence[Block]) -> dict[str, tuple[float, str]]:
     return units
 
 
+def _free(results: Block) -> dict[str, Block]:
+    """What was identified, by the name that people use; parameters of one word are one number."""
+    return {block.get("word") or name: block for name, block in results["parameters"].items() if block["free"]}
+
+
 def _parameter_table(results: Block) -> Table:
-    free = {name: block for name, block in results["parameters"].items() if block["free"]}
+    free = _free(results)
     lost = "not identifiable" if results["methods"][results["method"]]["converged"] else "–"
-    units = _shown_units([*free.values()])
+    plain = [block for block in free.values() if not own_unit(block)]
+    units = _shown_units(plain)
+
+    def unit(block: Block) -> tuple[float, str]:
+        return own_unit(block) or units[block["unit"]]
 
     def column(cell: Callable[[Block, float], str]) -> list[str]:
-        return [cell(block, units[block["unit"]][0]) for block in free.values()]
+        return [cell(block, unit(block)[0]) for block in free.values()]
+
+    def nominal(block: Block, _: float) -> str:
+        scale, shown = own_unit(block) or (1.0, block["unit"])
+        return f"{number_text(block['nominal'] / scale, 6)} {shown}".removesuffix(" 1")
 
     columns = {
-        "parameter": [f"{name} [{units[block['unit']][1]}]" for name, block in free.items()],
-        "nominal": column(lambda p, _: f"{number_text(p['nominal'], 6)} {p['unit']}".removesuffix(" 1")),
+        "parameter": [f"{name} [{unit(block)[1]}]" for name, block in free.items()],
+        "nominal": column(nominal),
     }
     if results["simulated"]:
         columns["|true - nominal|"] = column(lambda p, scale: figure_text(p, "error_before", scale))
@@ -320,10 +335,14 @@ def _rows(results: Block) -> Iterator[Row]:
                 low, high = block.get("spread", {}).get(key, (None, None))
                 yield subject, name, prefix + key, unit, block[key], low, high
 
+    keys: tuple[str, ...] = ("nominal", "value", "sd", "true", "error_before", "deviation")
     for name, block in results["parameters"].items():
-        yield from of(
-            "parameter", name, block, block["unit"], ("nominal", "value", "sd", "true", "error_before", "deviation")
-        )
+        yield from of("parameter", name, block, block["unit"], keys)
+    # Parameters of one word are one number; intervals over machines are above.
+    for block in {block.get("word"): block for block in results["parameters"].values()}.values():
+        if own := own_unit(block):
+            told = {key: None if block[key] is None else block[key] / own[0] for key in keys if key in block}
+            yield from of("number", block["word"], told, block["shown"], keys)
     for method, block in results["methods"].items():
         for part in ("position", "rotation"):
             test = block["test"][part]

@@ -282,6 +282,8 @@ def _parameters(measured: Measured, selection: Selection, found: Found, resample
             "identifiable": identifiable,
             "unit": parameter.unit,
             "leg": parameter.leg,
+            "word": parameter.word,
+            "shown": parameter.shown,
         }
         if i is not None and resampled is not None:
             entry["sd_bootstrap"] = float(resampled[i]) if identifiable else None

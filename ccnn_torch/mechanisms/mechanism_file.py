@@ -197,7 +197,7 @@ def _chain(arm: SerialArm) -> tuple[list[_Frame], _Frame]:
     """Fixed transforms before each joint's motion, base included, and behind the last, tool included."""
     n = len(arm.joints)
     values = arm.nominal
-    links = values[6:-6].reshape(n, -1)
+    links = arm.links(values)
     still = torch.zeros(n, dtype=torch.float64)
     rotations, translations = arm._transform(links, still, still, arm.axes)
     fixed = [(rotations[i], translations[i]) for i in range(n)]
@@ -241,6 +241,8 @@ def write_machine(
 ) -> list[Path]:
     """Write `STEM.yaml`, of a serial arm also `STEM.urdf` and, where it is one of DH parameters, `STEM_dh.yaml`.
 
+    An arm whose drives have leads or couplings of their own has no URDF.
+
     Args:
         mechanism: with the values found.
         nominal: what was there before, by name [SI].
@@ -250,7 +252,8 @@ def write_machine(
         joint_map: the joints as sums of its records' columns.
     """
     texts = {f"{stem}.yaml": mechanism_text(mechanism, nominal, columns, joint_map)}
-    if isinstance(mechanism, SerialArm):
+    # A URDF has no word for what a drive moves beside its joint, or too far.
+    if isinstance(mechanism, SerialArm) and not mechanism.drives:
         texts[f"{stem}.urdf"] = urdf_text(mechanism)
         if mechanism.convention != "urdf":
             texts[f"{stem}_dh.yaml"] = dh_text(mechanism)

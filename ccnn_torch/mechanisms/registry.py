@@ -17,6 +17,7 @@ from ccnn_torch.mechanisms.dh_file import read_dh_file, read_urdf
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.frames.instrument import Instrument, instrument
 from ccnn_torch.mechanisms.frames.partial import Partial, Seen
+from ccnn_torch.mechanisms.kinds.machine_file import build_machine, read_machine_file
 from ccnn_torch.mechanisms.machines.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.machines.five_bar import FiveBar
 from ccnn_torch.mechanisms.machines.overconstrained import Overconstrained2Dof
@@ -243,6 +244,14 @@ REGISTRY: dict[str, Callable[..., Mechanism]] = {
     "pair": _pair,
 }
 
+
+def _machine(machine: str, **content: Any) -> Mechanism:
+    """A machine of a kind in the numbers that people know, as its machine file has them."""
+    return build_machine({"machine": machine, **content}, "mechanism_keys", REGISTRY)
+
+
+REGISTRY["machine"] = _machine
+
 _READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
 _YAML = (".yaml", ".yml")
 _MODELS = (".safetensors", ".onnx", ".json")
@@ -257,7 +266,8 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
 
     Args:
         spec: a name in the registry (`tripod`, `five_bar`, `stewart`, …), a DH file (.yaml), a URDF (.urdf), an
-            identified machine's mechanism file (.yaml, as `ccnn identify` writes it), the machine of a model file
+            identified machine's mechanism file (.yaml, as `ccnn identify` writes it), a machine file (.yaml, as
+            `ccnn new --mechanism KIND` writes it), the machine of a model file
             (.safetensors, .onnx) or of a diagnosis.json, or `path/to/file.py:Name`: a class, a `Simulator`, or a
             function that makes one.
         allow_code: run the Python file that an identified machine's mechanism file names.
@@ -275,6 +285,9 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         file = read_mechanism_file(spec)
         if file is not None:
             return mechanism_of_file(file, "value", allow_code, keys)
+        machine = read_machine_file(spec)
+        if machine is not None:
+            return build_machine({**machine, **keys}, spec, REGISTRY)
     if Path(spec).suffix.lower() in _MODELS and spec not in REGISTRY:
         if keys:
             raise InputError(f"mechanism_keys: {spec} has the keys of its own machine; leave out {', '.join(keys)}")
@@ -287,7 +300,8 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
     else:
         mechanism = _call(spec, maker, keys)
-    if (spec in REGISTRY or is_plugin(spec)) and not isinstance(mechanism, Framed | Seen | Pair):
+    own = ("machine", "framed", "partial", "instrument", "pair")
+    if (spec in REGISTRY or is_plugin(spec)) and spec not in own and not isinstance(mechanism, Framed | Seen | Pair):
         mechanism.recipe = {"spec": spec, "keys": keys}
     return mechanism
 

@@ -37,6 +37,10 @@ def print_robot(model: LoadedModel) -> dict[str, str]:
         MethodFailedError: the model has no identified links, or its machine is no serial arm.
     """
     arm = _arm(model)
+    if arm.drives:
+        raise MethodFailedError(
+            f"a URDF has no key for the leads and couplings of '{arm.name}'; export c99, st or onnx"
+        )
     texts = {"robot.urdf": urdf_text(arm), "robot.xml": mjcf_text(arm)}
     return texts if arm.convention == "urdf" else texts | {"robot.yaml": dh_text(arm)}
 

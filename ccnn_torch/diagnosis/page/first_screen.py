@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis.verdict.findings import (
     frequency_words,
     places,
     repeats_of,
-    size_words,
+    told_words,
 )
 from ccnn_torch.diagnosis.verdict.text import (
     capital,
@@ -27,7 +27,7 @@ from ccnn_torch.diagnosis.verdict.text import (
     undetermined,
     words_for,
 )
-from ccnn_torch.display import display_unit, number_text, unit_text
+from ccnn_torch.display import display_unit, number_text, own_unit, unit_text
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.report.page import Answer
@@ -255,12 +255,12 @@ def numbers_table(results: Block, most: int) -> Table | None:
         clear = clear_parameters(parameters)
         for name in list(clear)[:each]:
             block = parameters[name]
-            value, unit, error = block["value"], block["unit"], _Z95 * block["sd"]
+            value, error = block["value"], _Z95 * block["sd"]
             part = block.get("part") or ""
-            enter = "–" if block.get("nominal") is None else _whole(block["nominal"] + value, unit, block["sd"])
-            text = f"{_named(name, part)}{_often(name, parameters)}{_counted(block)}"
+            enter = "–" if block.get("nominal") is None else _whole(block, block["nominal"] + value)
+            text = f"{block.get('word') or _named(name, part)}{_often(name, parameters)}{_counted(block)}"
             text = text if len(chosen) == 1 else f"{words_of(effect).short}, {text}"
-            rows.append((text, size_words(value, unit, 4), f"± {size_words(error, unit, 2, value)}", enter))
+            rows.append((text, told_words(block, value, 4), f"± {told_words(block, error, 2, value)}", enter))
         left_out += max(len(clear) - each, 0)
         notes += [_OWN_UNIT] if any(not block["unit"] for block in clear.values()) else []
         notes += [words_of(effect).meaning] if clear and words_of(effect).meaning else []
@@ -303,8 +303,11 @@ def _counted(block: Block) -> str:
     return f", about {about['joint']} = {number_text(about['value'] / scale, _MIDDLE_DIGITS)} {unit}"
 
 
-def _whole(value: float, unit: str, sd: float) -> str:
-    """A number to enter, to the digits that are known: lengths in mm, angles in rad and degrees."""
+def _whole(block: Block, value: float) -> str:
+    """A number to enter, to the digits that are known: in its own unit, else lengths in mm, angles in rad and °."""
+    unit, sd = block["unit"], block["sd"]
+    if own := own_unit(block):
+        return f"{value / own[0]:.{_decimals(sd / own[0])}f} {own[1]}"
     if unit == "m":
         scale, shown = display_unit("m", 1.0)
         return f"{value / scale:.{_decimals(sd / scale)}f} {shown}"

@@ -20,7 +20,7 @@ from ccnn_torch.diagnosis.verdict.text import (
     probability_words,
     words_for,
 )
-from ccnn_torch.display import display_unit, number_text, unit_text
+from ccnn_torch.display import display_unit, number_text, own_unit, unit_text
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.table import Table
 
@@ -143,12 +143,12 @@ def parameter_table(results: Block, most: int = 24) -> Table | None:
     for effect in results["verdict"]["effects"]:
         for name, block in by_name.get(effect, {}).get("parameters", {}).items():
             value, sd = block["value"], block["sd"]
-            scale, unit = display_unit(block["unit"], max(abs(value), sd or 0.0) or 1.0)
+            scale, unit = own_unit(block) or display_unit(block["unit"], max(abs(value), sd or 0.0) or 1.0)
             interval = "–" if sd is None else _interval(value, sd, scale)
             numbers = (number_text(value / scale, 4), number_text(_over(sd, scale), 2), interval)
             # Of a turning joint: whole numbers a turn.
             unit = "times a turn" if name.endswith(" frequency") and block["unit"] == "1" else unit
-            rows.append((f"{effect}: {name}", *numbers, unit))
+            rows.append((f"{effect}: {block.get('word') or name}", *numbers, unit))
             sizes.append(abs(value) / sd if sd else math.inf)
     if not rows:
         return None

@@ -126,6 +126,9 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
     for parameter in mechanism.geometry:
         if parameter.sense and parameter.name in found:
             found[parameter.name]["sense"] = parameter.sense
+        same = parameter.name if atom.effect.kind == "parameters" else parameter.same_as.removeprefix(f"{name} ")
+        if parameter.word and same in found:
+            found[same] |= {"word": parameter.word, "shown": parameter.shown}
     for coefficient, i in getattr(atom.effect, "counted_from", lambda _: {})(analysis.situation).items():
         if coefficient in found:
             joint, middle = mechanism.joints[i], float(analysis.situation.middle[i])

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccnn_torch.diagnosis.verdict.text import listed
-from ccnn_torch.display import display_unit, number_text, unit_text
+from ccnn_torch.display import display_unit, number_text, own_unit, unit_text
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
 
@@ -62,7 +62,11 @@ def findings(results: Block) -> list[Finding]:
         shown = [part for part in named if sizes[part][0] >= _LEAST_SHARE * max(sizes[p][0] for p in named)]
         most, more = shown[:_MOST_PARTS], len(shown) > _MOST_PARTS
         text = words.short if name != OUTLIER else f"{len(results['rows_set_aside'])} {words.short}"
-        if most:
+        worded = {block.get("word") for block in parameters.values() if not block.get("part")}
+        if most and worded.issuperset(most):
+            text += f": {'largest ' if more else ''}{'; '.join(f'{part} {sizes[part][1]}' for part in most)}"
+            most = []
+        elif most:
             text += f" of {places(shown)}: {'largest in ' if more else ''}"
             alone = len(shown) == 1
             text += "; ".join(sizes[part][1] if alone else f"{part} {sizes[part][1]}" for part in most)
@@ -127,6 +131,14 @@ def size_words(value: float, unit: str, digits: int = 3, beside: float | None = 
     return f"{number_text(value, digits)} {unit_text(unit)}"
 
 
+def told_words(block: Block, value: float, digits: int = 3, beside: float | None = None) -> str:
+    """A number in the unit that people tell it in where it has one, else as `size_words`."""
+    own = own_unit(block)
+    if own is None:
+        return size_words(value, block["unit"], digits, beside)
+    return f"{number_text(value / own[0], digits)} {own[1]}"
+
+
 def repeats_of(parameters: Block, joint: str) -> Block | None:
     """The number that tells how often a wave of a joint repeats; None where it is no wave."""
     return next((parameters[name] for n in _PERIODIC.values() if (name := f"{joint} {n}") in parameters), None)
@@ -145,7 +157,7 @@ def _sizes(parameters: Block) -> dict[str, tuple[float, str]]:
     chosen: dict[str, str] = {}
     # A gain before the zero that it has where it counts from.
     for name, block in sorted(clear_parameters(parameters).items(), key=lambda item: "about" not in item[1]):
-        chosen.setdefault(block.get("part") or "", name)
+        chosen.setdefault(block.get("part") or block.get("word") or "", name)
     if len({parameters[name]["unit"] for name in chosen.values()}) == 1:
         sizes = {part: abs(parameters[name]["value"]) for part, name in chosen.items()}
     else:
@@ -154,8 +166,10 @@ def _sizes(parameters: Block) -> dict[str, tuple[float, str]]:
     for part in sorted(chosen, key=lambda p: -sizes[p]):
         name, number = chosen[part], part.partition(" ")[2]
         own = "" if name in (part, f"q{number}") else f"{name.removeprefix(f'q{number} ')} "
+        word = parameters[name].get("word")
+        own = own if not word else "" if word == part else f"{word} "
         value, unit = parameters[name]["value"], parameters[name]["unit"]
-        size = size_words(value, unit)
+        size = told_words(parameters[name], value)
         if not unit and (before := parameters[name].get("nominal")) is not None:
             size = f"{size_words(before, unit)} → {size_words(before + value, unit)}"
         found[part] = (sizes[part], f"{own}{size}")

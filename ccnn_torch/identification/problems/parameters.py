@@ -24,9 +24,10 @@ class ParameterChoice:
     A pattern is a name with `*`, `?` or `[…]` (`A*`, `tool_?`), or `leg1.PATTERN`: those of leg 1 that match.
 
     Attributes:
-        free: what is identified; everything when None.
+        free: what is identified; everything that is not held when None.
         fixed: what is left at its start, also where `free` names it.
-        tied: groups that share one value; a group is a list of names and patterns, or one pattern.
+        tied: groups that share one value; a group is a list of names and patterns, or one pattern. Those of the
+            mechanism's own where there are none.
         prior: standard deviation of a Gaussian prior around the start, by name or pattern [SI].
     """
 
@@ -91,10 +92,17 @@ def select_parameters(
     names = [g.name for g in geometry]
     nominal = torch.tensor([g.nominal for g in geometry], dtype=torch.float64)
     whole = (nominal if start is None else start.detach()).reshape(-1, len(names))
-    free = set(names) if choice.free is None else match_parameters(geometry, choice.free, "free")
+    free = (
+        {g.name for g in geometry if not g.held}
+        if choice.free is None
+        else match_parameters(geometry, choice.free, "free")
+    )
     free -= match_parameters(geometry, choice.fixed, "fixed")
     if not free:
         raise InputError("parameters: nothing is left free; name at least one in free, or fix fewer")
+    if not choice.tied:
+        own = {g.tied: [other.name for other in geometry if other.tied == g.tied] for g in geometry if g.tied}
+        choice = dataclasses.replace(choice, tied=[group for group in own.values() if free.issuperset(group)])
     groups = _groups(geometry, choice, free, whole)
     spread = torch.zeros(len(groups), len(names), dtype=torch.float64, device=whole.device)
     for row, group in enumerate(groups):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -119,6 +121,18 @@ def compose(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tupl
     return rotation @ second[0], translation + (rotation @ second[1][..., None])[..., 0]
 
 
+def _start_and_shares(own: Sequence[Parameter], numbers: Sequence[Mapping[str, Any]]) -> tuple[Tensor, Tensor]:
+    """Parameters `l` without the numbers [SI], and what one unit of each number adds to them, `k x l`."""
+    names = [p.name for p in own]
+    shares = torch.zeros(len(numbers), len(own), dtype=torch.float64)
+    for row, number in zip(shares, numbers, strict=True):
+        for name, share in number["of"].items():
+            row[names.index(name)] = share
+    return torch.tensor([p.nominal for p in own], dtype=torch.float64), shares
+
+
+# Plausible share by which a drive moves another joint, or its own too far: that of a gear or a scale.
+_DRIVE = 1e-3
 MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
 
@@ -129,8 +143,10 @@ class SerialArm(Mechanism):
     """base · link 1 · … · link n · tool; pose x, y, z [m] and rotation vector rx, ry, rz [rad] in the record's frame.
 
     Parameters in order: the base frame (6: position, rotation vector), each link's (DH: a, alpha, d, theta; URDF: x, y,
-    z, roll, pitch, yaw), the tool frame (6). `solve_inverse` is damped Newton to the closest pose in
-    (position, rotation_weight x rotation vector), from `guess`: for records the guess is the commanded joints.
+    z, roll, pitch, yaw), those of drives, the tool frame (6). With `numbers` these stand in the place of the links' and
+    drives': each adds to some of them, so that the links are linear in what people know of the machine.
+    `solve_inverse` is damped Newton to the closest pose in (position, rotation_weight x rotation vector), from `guess`:
+    for records the guess is the commanded joints.
 
     Attributes:
         unknown_frames: those of "base" and "tool" that must be fitted to records first (`frames.fit_frames`).
@@ -138,6 +154,8 @@ class SerialArm(Mechanism):
         parallel_axes: groups of joints (counted from 1) with parallel axes.
         orientation: "rotation_vector", or "none": the pose is x, y, z alone.
         rotation_weight: [m/rad].
+        drives: pairs of joints i, j (from 1): the drive of joint j moves joint i as well, by parameter driveij for each
+            unit; of i = j joint i is off by that share (lead, gear ratio).
     """
 
     orientations = ("rotation_vector", "quaternion", "none")
@@ -145,6 +163,8 @@ class SerialArm(Mechanism):
     signs: Tensor
     revolute: Tensor
     limits: Tensor
+    _start: Tensor
+    _shares: Tensor
 
     def __init__(
         self,
@@ -164,6 +184,8 @@ class SerialArm(Mechanism):
         parallel_axes: Sequence[Sequence[int]] = (),
         orientation: str = "rotation_vector",
         rotation_weight: float = 0.04,
+        drives: Sequence[Sequence[int]] = (),
+        numbers: Sequence[Mapping[str, Any]] = (),
     ) -> None:
         """Build from plain numbers [SI].
 
@@ -177,7 +199,9 @@ class SerialArm(Mechanism):
             base, tool: frames, position and rotation vector.
             tool_offset: position of the tool, or "unknown"; replaces `tool` where the pose has no orientation.
             limits: lowest and highest value per joint, for sampling only; a full turn or a metre when None.
-            unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight: see the class.
+            unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight, drives: see the class.
+            numbers: fields of a `Parameter`, and `of`: what one unit of it adds to links' and drives' parameters, by
+                name; `links` are then what is there without them.
 
         Raises:
             InputError: unknown convention or orientation.
@@ -198,13 +222,27 @@ class SerialArm(Mechanism):
         types = tuple(joint_types or ["revolute"] * n)
         self._transform, names, units, self._axis_before = LINKS[convention]
         geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(FRAME, base, strict=True)]
+        own = []
         for i, row in enumerate(links):
-            geometry += [Parameter(f"{p}{i + 1}", u, v) for p, u, v in zip(names, units, row, strict=True)]
-        geometry += [Parameter(f"tool_{c}", u, v) for (c, u), v in zip(FRAME, tool, strict=True)]
+            own += [Parameter(f"{p}{i + 1}", u, v) for p, u, v in zip(names, units, row, strict=True)]
+        joint_units = ["rad" if t == "revolute" else "m" for t in types]
+        for i, j in drives:
+            to, by = joint_units[i - 1], joint_units[j - 1]
+            own.append(Parameter(f"drive{i}{j}", "1" if to == by else f"{to}/{by}", 0.0, scale=_DRIVE))
+        count = len(own)
+        start, shares = _start_and_shares(own, numbers)
+        if numbers:
+            own = [Parameter(**{k: v for k, v in number.items() if k != "of"}) for number in numbers]
+            geometry = [replace(p, held="base" not in unknown) for p in geometry]
+        geometry += own
+        geometry += [
+            Parameter(f"tool_{c}", u, v, held=bool(numbers) and "tool" not in unknown)
+            for (c, u), v in zip(FRAME, tool, strict=True)
+        ]
         pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
         super().__init__(
             name=name,
-            joints=[Coordinate(f"q{i + 1}", "rad" if t == "revolute" else "m") for i, t in enumerate(types)],
+            joints=[Coordinate(f"q{i + 1}", unit) for i, unit in enumerate(joint_units)],
             pose=[Coordinate(c, u) for c, u in pose],
             geometry=geometry,
             low=[-math.pi] * len(pose),
@@ -220,6 +258,9 @@ class SerialArm(Mechanism):
         self.register_buffer("signs", torch.tensor(joint_sign or [1.0] * n, dtype=torch.float64))
         self.register_buffer("revolute", torch.tensor(turn))
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
+        self.drives, self._named, self._links_size = tuple(map(tuple, drives)), bool(numbers), count - len(drives)
+        self.register_buffer("_start", start, persistent=False)
+        self.register_buffer("_shares", shares, persistent=False)
         self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
         self._follow_nominal()
 
@@ -233,7 +274,7 @@ class SerialArm(Mechanism):
     @property
     def reach(self) -> float:
         """Sum of the lengths of links and tool and of prismatic travel [m]; nothing is farther from the base."""
-        rows = self.nominal[6:-6].reshape(len(self.joints), -1)
+        rows = self.links(self.nominal)
         lengths = rows[:, :3] if self.convention == "urdf" else rows[:, (0, 2)]
         travel = self.limits.abs().amax(-1)[~self.revolute].sum()
         return float(lengths.norm(dim=-1).sum() + self.nominal[-6:-3].norm() + travel)
@@ -297,7 +338,8 @@ class SerialArm(Mechanism):
         """Positions no farther from the base than the reach: necessary, not sufficient; `...`, bool."""
         values = self.resolve(parameters)
         distance: Tensor = torch.linalg.vector_norm(pose[..., :3] - values[..., :3], dim=-1)
-        return distance <= self.reach
+        # Of a head that only turns every pose is that far.
+        return distance <= self.reach * (1 + 1e-9)
 
     def in_own_base(self, position: Tensor, vectors: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """A measured position `... x 3` [m] and vectors `... x v x 3` in the arm's own base, without the base frame."""
@@ -319,15 +361,44 @@ class SerialArm(Mechanism):
         """Flange in the arm's own base, without base and tool frame: rotation `... x 3 x 3`, position `... x 3` [m]."""
         return self.link_frames(joints, self.resolve(parameters))[-1]
 
+    def links(self, values: Tensor) -> Tensor:
+        """Parameters of the links, `... x n x 4` (DH) or `... x n x 6`, of all parameters `... x k` [SI]."""
+        own = self._of_links(values)[..., : self._links_size]
+        return own.reshape(*values.shape[:-1], len(self.joints), -1)
+
+    def _of_links(self, values: Tensor) -> Tensor:
+        """Parameters of the links, then of the drives."""
+        own = values[..., 6:-6]
+        return self._start + own @ self._shares if self._named else own
+
+    def coupled(self, values: Tensor) -> Tensor | None:
+        """How joints move for each unit of the commands, `... x n x n`; None where each drive moves its own by one."""
+        if not self.drives:
+            return None
+        own = self._of_links(values)[..., self._links_size :]
+        n = len(self.joints)
+        spread = torch.zeros(len(self.drives), n, n, dtype=values.dtype)
+        for k, (i, j) in enumerate(self.drives):
+            spread[k, i - 1, j - 1] = 1
+        more = own @ spread.flatten(1)
+        return torch.eye(n, dtype=values.dtype) + more.reshape(*more.shape[:-1], n, n)
+
+    def driven(self, joints: Tensor, values: Tensor) -> Tensor:
+        """Joints as the drives move them, `... x n`."""
+        coupled = self.coupled(values)
+        return joints if coupled is None else (coupled @ joints[..., None])[..., 0]
+
     def link_transforms(self, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """From each link to the one before: rotation `... x n x 3 x 3` and translation `... x n x 3` [m]."""
-        links = values[..., 6:-6].reshape(*values.shape[:-1], len(self.joints), -1)
+        """From each link to the one before: rotation `... x n x 3 x 3` and translation `... x n x 3` [m].
+
+        joints: as the drives move them.
+        """
         motion = joints * self.signs
-        return self._transform(links, motion * self.revolute, motion * ~self.revolute, self.axes)
+        return self._transform(self.links(values), motion * self.revolute, motion * ~self.revolute, self.axes)
 
     def link_frames(self, joints: Tensor, values: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Frames of the links one after the other, n + 1 of them, from the arm's own base to the flange."""
-        rotations, translations = self.link_transforms(joints, values)
+        rotations, translations = self.link_transforms(self.driven(joints, values), values)
         lead = translations.shape[:-2]
         start = torch.eye(3, dtype=joints.dtype).expand(*lead, 3, 3), torch.zeros(*lead, 3, dtype=joints.dtype)
         frames = [start, (rotations[..., 0, :, :], translations[..., 0, :])]
@@ -355,7 +426,16 @@ class SerialArm(Mechanism):
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Geometric Jacobian, closed form; see `Mechanism.jacobian`."""
         values = self.resolve(parameters)
-        frames = self.link_frames(joints, values)
+        linear, angular = self._rates(self.link_frames(joints, values), values)
+        base = rotation_vector_to_matrix(values[..., 3:6]).mT
+        rates = linear @ base
+        if self.orientation != "none":
+            rates = torch.cat([rates, angular @ base], dim=-1)
+        coupled = self.coupled(values)
+        return rates.mT if coupled is None else rates.mT @ coupled
+
+    def _rates(self, frames: list[Frames], values: Tensor) -> Screws:
+        """Velocity of the tip and rate of rotation by each joint as driven, in the arm's own base; `... x n x 3`."""
         rotation, position = frames[-1]
         tip = position + (rotation @ values[..., -6:-3, None])[..., 0]
         holders = frames[:-1] if self._axis_before else frames[1:]
@@ -363,11 +443,15 @@ class SerialArm(Mechanism):
         # A point on the axis gives the lever arm of a revolute joint; a prismatic one only moves along its axis.
         swept = torch.linalg.cross(axes, tip[..., None, :] - torch.stack([f[1] for f in holders], dim=-2), dim=-1)
         turning, signs = self.revolute[:, None], self.signs[:, None]
-        base = rotation_vector_to_matrix(values[..., 3:6]).mT
-        linear = (torch.where(turning, swept, axes) * signs) @ base
-        if self.orientation == "none":
-            return linear.mT
-        return torch.cat([linear, (axes * turning * signs) @ base], dim=-1).mT
+        return torch.where(turning, swept, axes) * signs, axes * turning * signs
+
+    def _by_own(self, columns: Tensor, rates: Tensor, joints: Tensor) -> Tensor:
+        """Columns of the parameters between the frames, `... x k x 3`, from those of the links `... x l x 3` and of the
+        joints as driven `... x n x 3`."""
+        if self.drives:
+            more = [rates[..., i - 1, :] * joints[..., j - 1, None] for i, j in self.drives]
+            columns = torch.cat([columns, torch.stack(more, -2).expand(*columns.shape[:-2], -1, 3)], -2)
+        return self._shares @ columns if self._named else columns
 
     def parameter_jacobian(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
@@ -378,8 +462,7 @@ class SerialArm(Mechanism):
         flange, place = frames[-1]
         tip = place + (flange @ values[..., -6:-3, None])[..., 0]
         rotations, places = (torch.stack([f[k] for f in frames], dim=-3 + k) for k in (0, 1))
-        count = len(self.joints)
-        links = values[..., 6:-6].reshape(*values.shape[:-1], count, -1)
+        count, links = len(self.joints), self.links(values)
         lead = tip.shape[:-1]
         before = rotations[..., :-1, :, :].expand(*lead, count, 3, 3), places[..., :-1, :].expand(*lead, count, 3)
         after = rotations[..., 1:, :, :], places[..., 1:, :]
@@ -388,8 +471,10 @@ class SerialArm(Mechanism):
         )
         base = rotation_vector_to_matrix(values[..., 3:6])
         # `... x 3 x k` each, in the frame of the poses.
-        linear = base @ moved.flatten(-3, -2).mT
-        angular = base @ turned.flatten(-3, -2).mT
+        linear, angular = (
+            base @ self._by_own(part.flatten(-3, -2), rate, joints).mT
+            for part, rate in zip((moved, turned), self._rates(frames, values), strict=True)
+        )
         base_rate, tool_rate = (rotation_vector_rate(values[..., k : k + 3]) for k in (3, values.shape[-1] - 3))
         lever = (base @ tip[..., None])[..., 0]
         whole = (base @ flange).expand(*lead, 3, 3)

@@ -77,6 +77,10 @@ class Coefficient(Result):
     """what the model has, of a parameter of the mechanism; the value is the difference to it"""
     sense: str = ""
     """which way it counts, where that is not the usual one"""
+    word: str = ""
+    """what people call it, where the machine's file says so"""
+    shown: str = ""
+    """the unit that they tell it in"""
     about: About | None = None
     """of a gain: the joint that it multiplies, and the command of it from which it counts [SI]"""
 

@@ -29,6 +29,10 @@ class Parameter(Result):
     identifiable: bool
     unit: str
     leg: int | None
+    word: str = ""
+    """what people call it; empty where the name is the word"""
+    shown: str = ""
+    """the unit that they tell it in; empty = SI"""
     sd_bootstrap: Number = None
 
 

@@ -1,0 +1,170 @@
+"""What is found of a machine comes back in the words and units of its file: on every page and in every file."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ccnn_torch.identification.klipper import printer_table
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms.kinds.machine_file import template
+from ccnn_torch.records import write_table
+
+Cli = Callable[..., tuple[int, str, str]]
+Array = NDArray[np.float64]
+UM = 1e-6
+
+
+def _gantry(folder: Path, seed: int) -> dict[str, float]:
+    """Rows of a gantry seen by a tracker that stands anywhere, in numpy alone; its numbers in µm/m."""
+    rng = np.random.default_rng(seed)
+    names = ("lead x", "lead y", "lead z", "squareness xy", "squareness xz", "squareness yz")
+    numbers = dict(zip(names, rng.normal(0, [150, 150, 150, 400, 400, 400]), strict=True))
+    lead = np.array([numbers[f"lead {a}"] for a in "xyz"]) * UM
+    xy, xz, yz = (numbers[f"squareness {a}"] * UM for a in ("xy", "xz", "yz"))
+    axes = np.array([[1, 0, 0], [np.sin(xy), np.cos(xy), 0], [np.sin(xz), np.sin(yz), np.sqrt(1 - xz**2 - yz**2)]])
+    joints = rng.uniform(0, [1.2, 0.8, 0.3], (60, 3))
+    turn, _ = np.linalg.qr(rng.normal(0, 1, (3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    seen = (joints * (1 + lead)) @ axes @ turn.T + rng.uniform(-2, 2, 3) + rng.normal(0, 3e-6, (60, 3))
+    columns = {f"q{k + 1}[m]": joints[:, k] for k in range(3)} | {f"{a}[m]": seen[:, k] for k, a in enumerate("xyz")}
+    write_table(folder / "gantry.csv", columns)
+    (folder / "gantry.yaml").write_text(template("gantry"))
+    return numbers
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_gantry_has_squareness_and_leads(seed: int, tmp_path: Path, cli: Cli) -> None:
+    numbers = _gantry(tmp_path, seed)
+    out = tmp_path / "found"
+    words = (f"records={tmp_path / 'gantry.csv'}", f"mechanism={tmp_path / 'gantry.yaml'}", "save_report=false")
+    code, screen, _ = cli("identify", *words, "--out", out)
+    assert code == 0 and "squareness xy [µm/m]" in screen and "12 of 12 parameters are identified" in screen
+    assert "squareness xy [µm/m]" in (out / "identified.md").read_text()
+    rows = list(csv.DictReader((out / "identified.csv").read_text().splitlines()))
+    told = {(r["name"], r["quantity"]): float(r["value"]) for r in rows if r["subject"] == "number"}
+    assert {r["unit"] for r in rows if r["subject"] == "number"} == {"um/m"}
+    for name, value in numbers.items():
+        assert abs(told[name, "value"] - value) < 3.5 * told[name, "sd"] < 40
+    found = json.loads((out / "identified.json").read_text())["parameters"]["squareness_xy"]
+    assert (found["word"], found["shown"], found["unit"]) == ("squareness xy", "um/m", "rad")
+    # The file is a machine again, with its words; a URDF would lose the leads.
+    again = {p.name: p for p in load_mechanism(str(out / "identified.yaml")).geometry}
+    assert again["squareness_xy"].word == "squareness xy" and not (out / "identified.urdf").exists()
+
+
+def test_a_diagnosis_tells_the_geometry_in_these_words(tmp_path: Path, cli: Cli) -> None:
+    numbers = _gantry(tmp_path, 3)
+    records, machine = tmp_path / "gantry.csv", tmp_path / "gantry.yaml"
+    effects = ("--effects", "geometry,joint_gain,coupling", "--no-network", "--quiet")
+    code, _, _ = cli("diagnose", "--records", records, "--mechanism", machine, *effects, "--out", tmp_path / "why")
+    assert code == 0
+    page = (tmp_path / "why" / "diagnosis.md").read_text()
+    largest = max(numbers, key=lambda n: abs(numbers[n]))
+    assert f"{largest} " in page and "µm/m" in page
+    found = json.loads((tmp_path / "why" / "diagnosis.json").read_text())
+    assert found["verdict"]["effects"] == ["geometry"]
+    block = next(e for e in found["effects"] if e["name"] == "geometry")["parameters"]["lead_x"]
+    assert (block["word"], block["shown"]) == ("lead x", "um/m")
+
+
+def test_a_coupling_of_a_scara_is_told_by_the_turn(tmp_path: Path, cli: Cli) -> None:
+    """The same effect as a number of the file goes by the same word."""
+    rng = np.random.default_rng(2)
+    q = rng.uniform([-2, -2, -0.2, -6], [2, 2, 0, 6], (80, 4))
+    x = 0.3 * np.cos(q[:, 0]) + 0.25 * np.cos(q[:, 0] + q[:, 1])
+    y = 0.3 * np.sin(q[:, 0]) + 0.25 * np.sin(q[:, 0] + q[:, 1])
+    place = np.stack([x, y, q[:, 2] + 0.15e-3 * q[:, 3] / (2 * np.pi)], -1) + rng.normal(0, 5e-6, (80, 3))
+    units = ("rad", "rad", "m", "rad")
+    columns = {f"q{k + 1}[{u}]": q[:, k] for k, u in enumerate(units)}
+    write_table(tmp_path / "scara.csv", columns | {f"{a}[m]": place[:, k] for k, a in enumerate("xyz")})
+    (tmp_path / "scara.yaml").write_text(template("scara").replace("base_frame: unknown", "base_frame: identity"))
+    effects = ("--effects", "coupling,joint_offset", "--no-network", "--quiet")
+    files = ("--records", tmp_path / "scara.csv", "--mechanism", tmp_path / "scara.yaml")
+    code, _, _ = cli("diagnose", *files, *effects, "--out", tmp_path / "why")
+    assert code == 0
+    page = (tmp_path / "why" / "diagnosis.md").read_text()
+    assert "quill coupling 0.1" in page and "mm/turn" in page
+
+
+def _printer(folder: Path) -> Path:
+    path = folder / "printer.yaml"
+    path.write_text("machine: delta_printer\nnumbers: {tower: [210 deg, 330 deg, 90 deg]}\n")
+    return path
+
+
+def test_rails_stay_straight_by_the_tolerance_of_the_machine_file(tmp_path: Path, cli: Cli) -> None:
+    """Rods and radii off by up to 0.7 mm, heights of the bed alone: the rails lean no more than makers let them."""
+    rng = np.random.default_rng(5)
+    rod, radius = 0.25 + np.array([4e-4, -3e-4, 6e-4]), 0.13 + np.array([5e-4, -7e-4, 3e-4])
+    towers, away, around = (
+        np.deg2rad([210.0, 330.0, 90.0]),
+        0.09 * rng.uniform(0, 1, 40) ** 0.5,
+        rng.uniform(0, 6.28, 40),
+    )
+    gap = radius * np.exp(1j * towers) - (away * np.exp(1j * around))[:, None]
+    joints = np.sqrt(rod**2 - np.abs(gap) ** 2)
+    columns = {f"q{k + 1}[m]": joints[:, k] for k in range(3)} | {"z[m]": rng.normal(0, 1e-5, 40)}
+    write_table(tmp_path / "bed.csv", columns)
+    words = (f"records={tmp_path / 'bed.csv'}", f"mechanism={_printer(tmp_path)}", "noise=10 um", "save_report=false")
+    leans = {}
+    for out, more in (("own", ()), ("wide", ("constraint={kind: pose, tolerance: {rad: 0.01}}",))):
+        code, screen, _ = cli("identify", *words, *more, "--out", tmp_path / out)
+        assert code == 0 and "printer.cfg (Klipper)" in screen and "endstop A [mm]" in screen
+        # One radius, as in the firmware: three of them and three angles would move and turn the whole printer.
+        assert screen.count("delta radius [mm]") == 1 and "tower angle C" not in screen
+        found = json.loads((tmp_path / out / "identified.json").read_text())["parameters"]
+        leans[out] = max(abs(found[f"{name}{i}"]["value"]) for name in ("lean", "skew") for i in (1, 2, 3))
+    assert leans["own"] < 6e-4 < leans["wide"]
+
+
+def test_a_firmware_with_the_lines_of_printer_cfg_prints_flat_and_true(tmp_path: Path) -> None:
+    """Klipper's own kinematics with the numbers of the table, on the machine with the identified ones."""
+    made = load_mechanism(str(_printer(tmp_path)))
+    rng = np.random.default_rng(1)
+    sizes = {"rod": 6e-4, "base": 6e-4, "angle": 4e-3, "offset": 8e-4, "platform": 0.0, "lean": 0.0, "skew": 0.0}
+    parameters = {
+        p.name: {"nominal": p.nominal, "value": p.nominal + rng.normal() * sizes[p.name[:-1]]} for p in made.geometry
+    }
+    table = printer_table({"mechanism": "delta_printer", "parameters": parameters})
+    assert table is not None
+    write = {
+        key: [row[3] for row in table.rows if row[1] == key] for key in ("arm_length", "angle", "position_endstop")
+    }
+    arm, angle = np.array(write["arm_length"], float), np.deg2rad(np.array(write["angle"], float))
+    radius, more = (
+        float(table.rows[0][3]),
+        np.array([text.removeprefix("x ") for text in write["position_endstop"]], float),
+    )
+    # Firmware, in mm: homed at the switches, it takes each carriage to be at endstop + what its rod reaches.
+    there = 300 + np.sqrt(250.0**2 - 130.0**2) + 1e3 * np.array([parameters[f"offset{i}"]["value"] for i in (1, 2, 3)])
+    taken = 300 + more + np.sqrt(arm**2 - radius**2)
+    around = rng.uniform(0, 2 * np.pi, 60)
+    bed = 80 * np.sqrt(rng.uniform(0, 1, 60)) * np.exp(1j * around)
+    carriages = np.sqrt(arm**2 - np.abs(radius * np.exp(1j * angle) - bed[:, None]) ** 2) + there - taken
+    reached = _true_place(carriages, parameters)
+    np.testing.assert_allclose(reached[:, 2], 0, atol=2e-3)
+    pairs = np.abs(np.diff(bed))
+    np.testing.assert_allclose(np.linalg.norm(np.diff(reached[:, :2], axis=0), axis=1), pairs, atol=5e-3)
+
+
+def _true_place(carriages: Array, parameters: dict[str, dict[str, float]]) -> Array:
+    """Where the nozzle is, from three spheres [mm]: Newton from the middle."""
+    rod, base, angle = (
+        np.array([parameters[f"{name}{i}"]["value"] for i in (1, 2, 3)]) for name in ("rod", "base", "angle")
+    )
+    centres = np.stack([1e3 * base * np.cos(angle), 1e3 * base * np.sin(angle)], -1)
+    place = np.zeros((len(carriages), 3))
+    for _ in range(50):
+        across = place[:, None, :2] - centres
+        up = place[:, 2:] - carriages
+        left = (across**2).sum(-1) + up**2 - (1e3 * rod) ** 2
+        slope = 2 * np.concatenate([across, up[..., None]], -1)
+        place = place - np.linalg.solve(slope, left[..., None])[..., 0]
+    return place

@@ -1,0 +1,132 @@
+"""Machine files: kinds, the numbers that people know, and the words and units in which they come back."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism, mechanism_from_description
+from ccnn_torch.mechanisms.kinds.machine_file import KINDS, template
+from ccnn_torch.mechanisms.pose import frame_jacobian
+from ccnn_torch.testing import check_mechanism
+
+
+def machine(folder: Path, kind: str, **changed: str) -> Mechanism:
+    """Of the kind's template, with lines in the place of its own."""
+    lines = template(kind).splitlines()
+    for key, value in changed.items():
+        at = next(i for i, line in enumerate(lines) if line.strip().startswith(f"{key}:"))
+        lines[at] = f"{lines[at].partition(':')[0]}: {value}"
+    path = folder / f"{kind}.yaml"
+    path.write_text("\n".join(lines))
+    return load_mechanism(str(path))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_template_is_a_mechanism_that_its_description_makes_again(kind: str, tmp_path: Path) -> None:
+    made = machine(tmp_path, kind)
+    again = mechanism_from_description(made.describe())
+    assert again.geometry == made.geometry and torch.equal(again.nominal, made.nominal)
+    check_mechanism(made)
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if "mechanism:" not in template(k)])
+def test_whole_poses_determine_every_number(kind: str, tmp_path: Path) -> None:
+    """The numbers that are not held, and the unknown frames, are a minimal set."""
+    made = machine(tmp_path, kind)
+    free = [i for i, p in enumerate(made.geometry) if not p.held]
+    sizes = torch.tensor([made.geometry[i].scale or 1e-3 for i in free], dtype=torch.float64)
+    rows = made.parameter_jacobian(made.sample_joints(100, torch.Generator().manual_seed(1)))[..., free] * sizes
+    values = torch.linalg.svdvals(rows.reshape(-1, len(free)))
+    assert values[-1] > 1e-6 * values[0]
+
+
+def test_a_gantry_moves_along_axes_of_its_numbers(tmp_path: Path) -> None:
+    made = machine(
+        tmp_path,
+        "gantry",
+        base_frame="identity",
+        lead_x="120 um/m",
+        squareness_xy="-0.4 mm/m +- 0.5 mrad",
+        squareness_yz="300 urad",
+    )
+    place = made.forward_kinematics(torch.tensor([0.9, 0.7, 0.2], dtype=torch.float64))[:3]
+    # Written out: each axis is a direction, y and z lean.
+    wanted = 0.9 * (1 + 120e-6) * np.array([1, 0, 0]) + 0.7 * np.array([-4e-4, 1, 0]) + 0.2 * np.array([0, 3e-4, 1])
+    np.testing.assert_allclose(place.numpy(), wanted, atol=1e-7)
+
+
+def test_a_mount_points_by_the_terms_that_astronomers_know(tmp_path: Path) -> None:
+    names = {"IA": 40, "IE": -25, "CA": 30, "NPAE": 50, "AN": -35, "AW": 20}
+    made = machine(tmp_path, "alt_azimuth", **{name: f"{value} arcsec" for name, value in names.items()})
+    ia, ie, ca, npae, an, aw = (np.deg2rad(v / 3600) for v in names.values())
+    azimuth, elevation = np.deg2rad(np.array([[-100, 20], [10, 50], [130, 70]])).T
+    found = made.forward_kinematics(torch.tensor(np.stack([azimuth, elevation], -1))).numpy()
+    # To the first order (Wallace 2008): where it points, less what its encoders say.
+    east = ia + (ca + npae * np.sin(elevation)) / np.cos(elevation)
+    east = east - (an * np.sin(azimuth) + aw * np.cos(azimuth)) * np.tan(elevation)
+    up = ie - an * np.cos(azimuth) + aw * np.sin(azimuth)
+    a, e = np.arctan2(found[:, 1], found[:, 0]), np.arcsin(found[:, 2] / np.linalg.norm(found, axis=1))
+    np.testing.assert_allclose(e - elevation, up, atol=1e-6)
+    np.testing.assert_allclose(np.cos(elevation) * (a - azimuth), np.cos(elevation) * east, atol=1e-6)
+
+
+def test_a_scara_lifts_its_quill_with_the_turn_of_joint_4(tmp_path: Path) -> None:
+    made = machine(tmp_path, "scara", base_frame="identity", quill_coupling="20 mm/turn", upper_arm="325 mm +- 0")
+    joints = torch.tensor([[0.3, -0.8, -0.1, 0.0], [0.3, -0.8, -0.1, np.pi]], dtype=torch.float64)
+    place = made.forward_kinematics(joints)[:, :3]
+    np.testing.assert_allclose((place[1] - place[0]).numpy(), [0, 0, 0.01], atol=1e-12)
+    np.testing.assert_allclose(float(place[0, 0]), 0.325 * np.cos(0.3) + 0.25 * np.cos(-0.5), atol=1e-12)
+    assert next(p for p in made.geometry if p.name == "upper_arm").held
+
+
+def test_jacobians_of_drives_and_numbers_are_the_derivatives(tmp_path: Path) -> None:
+    made = machine(tmp_path, "scara", quill_coupling="20 mm/turn")
+    assert isinstance(made, SerialArm)
+    draw = torch.Generator().manual_seed(3)
+    values = made.nominal + 0.02 * torch.randn(len(made.nominal), generator=draw, dtype=torch.float64)
+    joints = made.sample_joints(6, draw)
+    by_joint = frame_jacobian(lambda q: made.frame(made.forward_kinematics(q, values)), joints)
+    torch.testing.assert_close(made.jacobian(joints, values), by_joint, atol=1e-9, rtol=0)
+    wide = values.expand(len(joints), -1)
+    by_number = frame_jacobian(lambda p: made.frame(made.forward_kinematics(joints, p)), wide)
+    torch.testing.assert_close(made.parameter_jacobian(joints, values), by_number, atol=1e-9, rtol=0)
+
+
+def test_a_delta_printer_has_a_value_for_each_tower(tmp_path: Path) -> None:
+    made = machine(tmp_path, "delta_printer", arm_length="[250.4 mm +- 0.05 mm, 250 mm, 249.8 mm]")
+    by_name = {p.name: p for p in made.geometry}
+    assert [by_name[f"rod{i}"].nominal for i in (1, 2, 3)] == pytest.approx([0.2504, 0.25, 0.2498])
+    assert by_name["rod1"].word == "rod A" and by_name["rod1"].shown == "mm"
+    assert by_name["rod1"].scale == pytest.approx(5e-5) and by_name["rod2"].scale == pytest.approx(5e-4)
+    assert {by_name[f"base{i}"].tied for i in (1, 2, 3)} == {"delta_radius"} and by_name["angle3"].held
+    assert by_name["lean2"].scale == pytest.approx(2e-4) and by_name["platform1"].held
+    assert made.nominal[[p.name for p in made.geometry].index("rod1")] == pytest.approx(0.2504)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("machine: gantri", "did you mean 'gantry'"),
+        ("machine: gantry\nnumbers: {lead_w: 1 um/m}", "numbers: 'lead_w' is not known; did you mean 'lead_"),
+        ("machine: gantry\nnumbers: {lead_x: 1 mm}", "numbers.lead_x is in 'mm'"),
+        ("machine: gantry\nnumbers: {lead_x: far}", "numbers.lead_x: 'far' is no number"),
+        ("machine: gantry\nnumbers: {lead_x: 1 um/m +- -3 um/m}", "the tolerance"),
+        ("machine: gantry\nnumbers: {lead_x: 1 +- 2 +- 3}", "two tolerances"),
+        ("machine: gantry\nnumbers: {lead_x: .inf}", "must be a finite number"),
+        ("machine: gantry\nnumbers: 3", "must have lines such as"),
+        ("machine: gantry\ntool_fram: identity", "the key 'tool_fram' is not known; did you mean 'tool_frame'"),
+        ("machine: gantry\nbase_frame: [1, 2]", "base_frame: must be unknown, identity or"),
+        ("machine: gantry\nlimits: {q1: [1 mm, 0 mm]}", "limits.q1: must be"),
+        ("machine: gantry\nlimits: {q9: [0 mm, 1 mm]}", "limits: 'q9' is not known"),
+        ("machine: delta_printer\nnumbers: {endstop: [1 mm, 2 mm]}", "needs one value, or a list of 3, not 2"),
+    ],
+)
+def test_what_is_wrong_in_a_machine_file_is_one_sentence(line: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(line)
+    with pytest.raises(InputError, match=r"wrong\.yaml") as error:
+        load_mechanism(str(path))
+    assert said in str(error.value) and "\n" not in str(error.value)
