@@ -26,7 +26,7 @@ from ccnn_torch.report.json_files import plain
 from ccnn_torch.report.results.run import RunResults
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Callback, Scaling
-from ccnn_torch.verification.promise import configurations, promise_block
+from ccnn_torch.verification.promise import configurations, of_whole, promise_block
 
 Watch = Callable[[Prepared, str, str, Scaling], list[Callback]]
 """Callbacks of one training, given the rows, the method, the phase (`choose` or `fit`) and the phase's scaling."""
@@ -161,7 +161,8 @@ class Calibration:
         prepared, repeat = self.prepared, self.repeat(method)
         test = prepared.dataset.splits[repeat].test
         found = (self.before, self.outcomes[method].explained)
-        before, explained = (_rows_of(error, len(prepared.joints), repeat, test) for error in found)
+        about = prepared.pose[repeat, test], prepared.mechanism.pose
+        before, explained = (of_whole(_rows_of(e, len(prepared.joints), repeat, test), *about) for e in found)
         return promise_block(
             before, explained, configurations(prepared.joints[repeat, test], prepared.mechanism.joints)
         )

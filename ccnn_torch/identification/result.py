@@ -30,7 +30,7 @@ from ccnn_torch.identification.solve import (
     pieces_of,
 )
 from ccnn_torch.mechanisms import PoseError
-from ccnn_torch.verification.promise import configurations, promise_block
+from ccnn_torch.verification.promise import configurations, of_whole, promise_block
 from ccnn_torch.version import __version__
 
 Z95 = 1.959963984540054
@@ -206,7 +206,8 @@ def promised(measured: Measured, found: Found) -> dict[str, Any] | None:
     """What the held-out rows promise for new ones; None with several machines, of which only one is written."""
     if measured.machines > 1:
         return None
-    before, after = part_of_error(found.before, 0), part_of_error(found.after, 0)
+    about = measured.test.observed[0], measured.mechanism.pose
+    before, after = (of_whole(part_of_error(e, 0), *about) for e in (found.before, found.after))
     return promise_block(before, after, configurations(measured.test.joints[0], measured.mechanism.joints))
 
 

@@ -93,6 +93,16 @@ def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[s
     }
 
 
+def of_whole(error: PoseError, pose: Tensor, coordinates: Sequence[Coordinate]) -> PoseError:
+    """Pose errors `s` that can be promised: NaN in rows that lack a length or an angle of theirs (NaN in `s x p`)."""
+    lacking = (
+        pose[:, [k for k, c in enumerate(coordinates) if c.unit == unit]].isnan().any(-1) for unit in ("m", "rad")
+    )
+    first, last = (None if e is None else torch.where(gap, torch.nan, e) for e, gap in zip(error, lacking, strict=True))
+    assert first is not None
+    return PoseError(first, last)
+
+
 def promised(promise: Mapping[str, Any], kind: str, count: int) -> Promised | None:
     """RMS that new rows should have, and the limits that it passes once in twenty on either side; None = no promise.
 
