@@ -244,8 +244,9 @@ def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, ta
     if not quiet:
         say_place(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
     if found.results["methods"][found.results["method"]]["converged"] == 0:
+        why = " ".join([not_settled(found.results), *found.results["doubts"]])
         raise MethodFailedError(
-            f"{not_settled(found.results)} What was written to {path} is there to look into it, not to use; more rows, "
+            f"{why} What was written to {path} is there to look into it, not to use; more rows, "
             "more starts (starts=10) or fewer free parameters may help"
         )
 

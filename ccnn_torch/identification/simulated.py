@@ -142,13 +142,12 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
 def _errors(mechanism: Mechanism, about: SimulateConfig, seeds: list[int]) -> Tensor:
     """Parameter errors, `r x K` [SI]: the given ones beside normal draws."""
     geometry = mechanism.geometry
-    usual = [0.0 if about.values else plausible_error(p) for p in geometry]
+    usual = [0.0 if p.held else plausible_error(p) for p in geometry]
     given = about.errors
     if isinstance(given, dict):
-        sd = sizes_by_name(given, geometry, "simulate.errors", usual)
+        sd = sizes_by_name(given, geometry, "simulate.errors", [0.0] * len(usual) if about.values else usual)
     else:
-        factor = size(given, "1", "simulate.errors")
-        sd = factor * torch.tensor([plausible_error(p) for p in geometry], dtype=torch.float64)
+        sd = size(given, "1", "simulate.errors") * torch.tensor(usual, dtype=torch.float64)
     fixed = sizes_by_name(about.values, geometry, "simulate.values", [0.0] * len(geometry))
     return fixed + sd * normal_draws(sd.shape, seeds, _ERRORS, 0)
 

@@ -1,8 +1,10 @@
 """A measuring frame far away, a search that does not end, and rows that contradict the noise they are said to have."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,6 +15,7 @@ from ccnn_torch.identification.identify import IDENTIFY, Identification
 from ccnn_torch.mechanisms import Framed, load_mechanism
 from ccnn_torch.records import write_table
 
+Cli = Callable[..., tuple[int, str, str]]
 FAR = {"base_x": 2.0, "base_y": -1.0, "base_z": 0.5, "base_rx": 0.3, "base_ry": -0.2, "base_rz": 2.5}
 FIVE_BAR_FREE = {"fixed": ["A*", "gamma*"]}
 
@@ -160,3 +163,29 @@ def test_too_few_rows_speak_of_parameters_and_not_of_a_linear_fit(tmp_path: Path
     with pytest.raises(InputError, match=r"cannot determine 12 free parameters; measure at least") as said:
         identified(path, mechanism="five_bar", frame={"base": True}, parameters=FIVE_BAR_FREE)
     assert "linear" not in str(said.value)
+
+
+def test_parallel_axes_that_are_tilted_ask_for_six_parameters_a_link(tmp_path: Path, cli: Cli) -> None:
+    """A SCARA's second axis leans by 0.5 mrad: a Denavit-Hartenberg table cannot follow it, and does not settle."""
+    rng = np.random.default_rng(2)
+    joints = rng.uniform([-2, -2, -0.15], [2, 2, 0], (60, 3))
+    lean = np.array([[1, 0, -3e-4], [0, 1, -4e-4], [3e-4, 4e-4, 1]])
+    a, b = joints[:, 0], joints[:, 1]
+    elbow = 0.3 * np.stack([np.cos(a), np.sin(a), 0 * a], -1)
+    fore = np.stack([0.25 * np.cos(b), 0.25 * np.sin(b), joints[:, 2]], -1) @ lean.T
+    turn = np.array([[np.cos(a), -np.sin(a), 0 * a], [np.sin(a), np.cos(a), 0 * a], [0 * a, 0 * a, 1 + 0 * a]])
+    place = elbow + np.einsum("ijk,kj->ki", turn, fore) + rng.normal(0, 8e-6, (60, 3))
+    columns = {"q1[rad]": a, "q2[rad]": b, "q3[m]": joints[:, 2]}
+    write_table(tmp_path / "rows.csv", columns | {f"{c}[m]": place[:, k] for k, c in enumerate("xyz")})
+    (tmp_path / "arm.yaml").write_text(
+        "dof: 3\nconvention: standard Denavit-Hartenberg\nunits: {length: m, angle: deg}\n"
+        "joint_types: [revolute, revolute, prismatic]\na: [0.3, 0.25, 0]\nalpha: [0, 0, 0]\nd: [0, 0, 0]\n"
+        "theta: [0, 0, 0]\nbase_frame: unknown\ntool_offset: [0, 0, 0]\n"
+    )
+    words = (f"records={tmp_path / 'rows.csv'}", f"mechanism={tmp_path / 'arm.yaml'}", "save_report=false")
+    code, _, said = cli("identify", *words, "--out", tmp_path / "given")
+    assert code != 0 and "The axes of joints 1 and 2 are parallel" in said and "write links=six" in said
+    # The hint is right.
+    code, screen, _ = cli("identify", *words, "links=six", "--out", tmp_path / "six")
+    after = json.loads((tmp_path / "six" / "identified.json").read_text())["test"]["position"]["after"]
+    assert code == 0 and "are parallel" not in screen and after < 2e-5

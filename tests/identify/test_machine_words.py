@@ -60,9 +60,9 @@ def test_a_gantry_has_squareness_and_leads(seed: int, tmp_path: Path, cli: Cli) 
 
 
 def test_a_diagnosis_tells_the_geometry_in_these_words(tmp_path: Path, cli: Cli) -> None:
-    numbers = _gantry(tmp_path, 3)
+    numbers = _gantry(tmp_path, 2)
     records, machine = tmp_path / "gantry.csv", tmp_path / "gantry.yaml"
-    effects = ("--effects", "geometry,joint_gain,coupling", "--no-network", "--quiet")
+    effects = ("--effects", "geometry,joint_gain,coupling,instrument", "--no-network", "--quiet")
     code, _, _ = cli("diagnose", "--records", records, "--mechanism", machine, *effects, "--out", tmp_path / "why")
     assert code == 0
     page = (tmp_path / "why" / "diagnosis.md").read_text()

@@ -158,8 +158,9 @@ def _sizes(parameters: Block) -> dict[str, tuple[float, str]]:
     # A gain before the zero that it has where it counts from.
     for name, block in sorted(clear_parameters(parameters).items(), key=lambda item: "about" not in item[1]):
         chosen.setdefault(block.get("part") or block.get("word") or "", name)
-    if len({parameters[name]["unit"] for name in chosen.values()}) == 1:
-        sizes = {part: abs(parameters[name]["value"]) for part, name in chosen.items()}
+    told = {name: own_unit(parameters[name]) or (1.0, parameters[name]["unit"]) for name in chosen.values()}
+    if len({unit for _, unit in told.values()}) == 1:
+        sizes = {part: abs(parameters[name]["value"]) / told[name][0] for part, name in chosen.items()}
     else:
         sizes = {part: abs(parameters[name]["value"]) / parameters[name]["sd"] for part, name in chosen.items()}
     found = {}

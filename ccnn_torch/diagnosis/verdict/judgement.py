@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -82,16 +82,20 @@ def judge_rows(analysis: Analysis) -> Judgement:
     if verdict.outside:
         drivers = drivers or next((d for f in usual.found if (d := _named(analysis, f)[1])), ())
         drivers += _second_driver(analysis, usual, found)
-    # The coefficients of effects that cannot be distinguished are not identifiable together.
+    # The coefficients of effects that cannot be distinguished are not identifiable together, nor those of an effect
+    # that does nothing that the others cannot do.
     alike = {name for some in verdict.classes.values() for name in some} - names
-    more = (
-        f
-        for f in analysis.found
-        if found.members and set(found.members) <= set(f.members) and not alike & _named(analysis, f)[0]
+    more = sorted(
+        (
+            f
+            for f in analysis.found
+            if found.members and set(found.members) <= set(f.members) and not alike & _named(analysis, f)[0]
+        ),
+        key=lambda f: -f.log_posterior,
     )
     return Judgement(
         found=found,
-        fullest=max(more, key=lambda f: f.log_posterior, default=found),
+        fullest=next((f for f in more if f is found or _is_least(analysis, f.members)), found),
         names=tuple(sorted(names, key=lambda n: -_energy(analysis, found, n))),
         classes=verdict.classes,
         probability=verdict.probability,
@@ -100,6 +104,22 @@ def judge_rows(analysis: Analysis) -> Judgement:
         marginal={a.name: marginal(leading, a.name) for a in analysis.atoms if not a.is_discrepancy},
         leading=leading,
     )
+
+
+def _rank(analysis: Analysis, members: Iterable[int]) -> int:
+    """How many directions of the rows a set of effects can move."""
+    flat, groups = analysis.dictionary.columns.flatten(0, 1), analysis.dictionary.groups
+    chosen = [flat[:, groups[i]] for i in members]
+    if not chosen:
+        return 0
+    sizes = torch.linalg.svdvals(torch.cat(chosen, -1))
+    return int((sizes > _SECOND_ORDER * sizes[0]).sum())
+
+
+def _is_least(analysis: Analysis, members: tuple[int, ...]) -> bool:
+    """Whether each effect of a set can do something that the others cannot."""
+    whole = _rank(analysis, members)
+    return all(_rank(analysis, fewer) < whole for fewer in subsets_with_one_less(members))
 
 
 def _in_order_of_library(
@@ -111,24 +131,14 @@ def _in_order_of_library(
     """The verdict by other names that do the very same on these rows, where the library lists those first.
 
     On axes that slide, scale and shear of a device are lead and squareness of the axes. Nothing changes where a name of
-    the verdict adds nothing to what the others can do: only its size speaks for it then.
+    the verdict adds nothing to what the others can do: only its size speaks for it then, unless fewer names do.
     """
-    flat, order = analysis.dictionary.columns.flatten(0, 1), [*EFFECTS]
-    chosen, inside = verdict.chosen, [e for e in explanations if not e.drivers]
-
-    def rank(*members: int) -> int:
-        if not members:
-            return 0
-        sizes = torch.linalg.svdvals(torch.cat([flat[:, analysis.dictionary.groups[i]] for i in members], -1))
-        return int((sizes > _SECOND_ORDER * sizes[0]).sum())
-
-    def is_least(e: Explanation[FittedSet]) -> bool:
-        members = e.best.members
-        return all(rank(*fewer) < rank(*members) for fewer in subsets_with_one_less(members))
+    order, chosen = [*EFFECTS], verdict.chosen
+    inside, own = [e for e in explanations if not e.drivers], chosen.best.members
 
     def is_same(e: Explanation[FittedSet]) -> bool:
-        members = e.best.members
-        return rank(*members) == rank(*chosen.best.members) == rank(*{*members, *chosen.best.members})
+        ranks = (_rank(analysis, members) for members in (e.best.members, own, {*e.best.members, *own}))
+        return len(set(ranks)) == 1
 
     def place(names: frozenset[str]) -> int:
         return max((order.index(n) if n in order else len(order) for n in names), default=-1)
@@ -136,12 +146,18 @@ def _in_order_of_library(
     def is_before(e: Explanation[FittedSet]) -> bool:
         return -1 < place(e.names - chosen.names) < place(chosen.names - e.names)
 
-    if verdict.outside or not any(map(is_before, inside)) or not is_least(chosen):
+    if verdict.outside or not any(map(is_before, inside)):
         return verdict
+    if not _is_least(analysis, own):
+        inside = [e for e in inside if len(e.names) < len(chosen.names)]
     # Where the data ask for implausible sizes, these tell apart what the columns do not.
     least = max(e.best.log_evidence for e in inside) - math.log(ODDS)
     same = [e for e in inside if e.best.log_evidence > least and is_same(e)]
-    told = min((e for e in same if is_before(e) and is_least(e)), key=lambda e: place(e.names), default=None)
+    told = min(
+        (e for e in same if is_before(e) and _is_least(analysis, e.best.members)),
+        key=lambda e: place(e.names),
+        default=None,
+    )
     if told is None:
         return verdict
     probability = max(verdict.probability, min(sum(e.probability for e in same), 1.0))

@@ -221,6 +221,8 @@ class SerialArm(Mechanism):
         n = len(links)
         types = tuple(joint_types or ["revolute"] * n)
         self._transform, names, units, self._axis_before = LINKS[convention]
+        pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
+        shown = {c for c, _ in pose}
         geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(FRAME, base, strict=True)]
         own = []
         for i, row in enumerate(links):
@@ -236,10 +238,9 @@ class SerialArm(Mechanism):
             geometry = [replace(p, held="base" not in unknown) for p in geometry]
         geometry += own
         geometry += [
-            Parameter(f"tool_{c}", u, v, held=bool(numbers) and "tool" not in unknown)
+            Parameter(f"tool_{c}", u, v, held=bool(numbers) and ("tool" not in unknown or c not in shown))
             for (c, u), v in zip(FRAME, tool, strict=True)
         ]
-        pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
         super().__init__(
             name=name,
             joints=[Coordinate(f"q{i + 1}", unit) for i, unit in enumerate(joint_units)],
