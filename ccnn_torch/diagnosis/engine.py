@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.checks.cautions import cautions, of_inferred
 from ccnn_torch.diagnosis.checks.mistakes import PlausibleRows, plausible_rows
-from ccnn_torch.diagnosis.checks.unrecorded import directions_of_order, missing_covariates, order_shows
+from ccnn_torch.diagnosis.checks.unrecorded import measured_order, missing_covariates, of_order, order_shows
 from ccnn_torch.diagnosis.discrepancy.local import CROSS
 from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes
@@ -126,14 +126,15 @@ def diagnose_rows(
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
     said = _judged(situation, measured, noise, effects, seed, instrument)
-    directions = directions_of_order(situation)
-    if order_shows(said.analysis, said.judgement, {n: way[said.chosen] for n, way in directions.items()}):
-        more = replace(situation, covariates={**situation.covariates, **directions})
-        other = _judged(more, measured, noise, effects, seed, instrument, tuple(directions))
+    for name, kind in of_order(situation).items():
+        columns = kind.columns(situation, measured_order(situation))
+        if not order_shows(said.analysis, said.judgement, {n: v[said.chosen] for n, v in columns.items()}, kind):
+            continue
+        more = replace(situation, covariates={**situation.covariates, **columns})
+        other = _judged(more, measured, noise, effects, seed, instrument, (*said.inferred, *columns))
         # Names that could not be asked for before, or a driver that was not there.
-        new = said.lacking.keys() & {*other.judgement.names}
-        if new or any(d.startswith("direction") for d in other.judgement.drivers):
-            said = other
+        if said.lacking.keys() & {*other.judgement.names} or any(d.startswith(name) for d in other.judgement.drivers):
+            said, situation = other, more
     return _diagnosis(said, noise is not None, seed)
 
 

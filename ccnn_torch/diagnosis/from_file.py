@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects import EFFECTS, OUTLIER, Coefficient, Effect, Shape, Situation, make_effect
+from ccnn_torch.effects.time import ROW, FrameDrift
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import parse_json, read_text
 from ccnn_torch.units import LARGEST
@@ -55,7 +56,7 @@ class Verdict:
     outside: bool = False
     covariates: tuple[str, ...] = ()
 
-    def on(self, situation: Situation) -> tuple[list[Known], list[str]]:
+    def on(self, situation: Situation, identify: bool = False) -> tuple[list[Known], list[str]]:
         """The effects on a machine and rows, for a controller that knows one row and not what was before it.
 
         Without a column of times there is no history: a thermal lag is none, the machine has settled. Effects that are
@@ -63,6 +64,7 @@ class Verdict:
 
         Args:
             situation: rows with all their covariates, time as well where it was measured.
+            identify: whether all parameters are identified beside: effects that are a part of these are left out.
 
         Returns:
             The effects, whose situation is `one_row_at_a_time`; and notes on what was left out, one sentence each.
@@ -75,6 +77,9 @@ class Verdict:
             notes.append("Beside the effects something is there that none describes: it is left to the network.")
         for name, values in self.effects:
             effect = make_effect(name)
+            if identify and effect.kind == "parameters":
+                notes.append("The verdict's geometry is left to geometry=identify, which fits all parameters.")
+                continue
             key = f"{self.path}: effects, {name}"
             lacking = effect.missing(situation.mechanism, [*situation.covariates])
             if lacking:
@@ -104,10 +109,30 @@ class Verdict:
             found.append(known)
         return found, notes
 
+    def of_machine(self) -> tuple[Verdict, Mapping[str, float] | None]:
+        """The same without a drift of the measuring frame, which is none of the machine; and the numbers of that."""
+        drift = dict(self.effects).get(FrameDrift.name)
+        return replace(self, effects=tuple(e for e in self.effects if e[0] != FrameDrift.name)), drift
+
+
+def in_time(situation: Situation, time: Tensor) -> Situation:
+    """Isolated rows that still have a place in the time in which a measuring frame drifts.
+
+    Args:
+        situation: rows as `one_row_at_a_time` gives them.
+        time: since the first row [s], or the numbers of the rows, `s`.
+    """
+    return replace(situation, covariates={**situation.covariates, ROW: time})
+
+
+def frame_drift(situation: Situation, values: Mapping[str, float]) -> Known:
+    """A drift of the measuring frame with numbers by name [SI]; situation: as `in_time` gives it."""
+    return _known(FrameDrift(), situation, values)
+
 
 def one_row_at_a_time(situation: Situation) -> Situation:
     """The same rows as if each were isolated: without their times."""
-    covariates = {name: value for name, value in situation.covariates.items() if name != "time"}
+    covariates = {name: value for name, value in situation.covariates.items() if name not in ("time", ROW)}
     return Situation(
         situation.mechanism, situation.joints, covariates, situation.gravity, situation.parameters, situation.guess
     )

@@ -14,7 +14,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.checks.mistakes import what_is_wrong
 from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
-from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, usable_verdict
+from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, frame_drift, in_time, usable_verdict
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.diagnosis.residual.distance import size_of
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, noise_of_columns
@@ -24,6 +24,7 @@ from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, used_
 from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.effects.found_machine import found_block
+from ccnn_torch.effects.time import ROW, FrameDrift, elapsed
 from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import BlackBox, Instrument, Mechanism, SerialArm, as_measured, fit_unknown, judge_frames
 from ccnn_torch.mechanisms.frames.partial import completed
@@ -226,17 +227,24 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
     recorded = replace(here, covariates={n: v for n, v in here.covariates.items() if n not in said.inferred})
     named = tuple((a.effect.name, _numbers(a, said)) for a in said.acting)
     try:
-        verdict = usable_verdict(Verdict(TRAINING_ROWS, here.gravity, named), recorded)[0]
-        if verdict is None:
+        whole, drift = Verdict(TRAINING_ROWS, here.gravity, named).of_machine()
+        verdict = usable_verdict(whole, recorded)[0]
+        if verdict is None and drift is None:
             return None
         situation = on_fitted_frames(recorded)
         identify = any(a.effect.kind == "parameters" for a in said.acting)
         if identify and isinstance(situation.mechanism, SerialArm):
             situation = replace(situation, mechanism=situation.mechanism.with_link_frames())
-        known = [k for k in verdict.on(recorded)[0] if k.effect.kind != "parameters"]
+        known = [] if verdict is None else [k for k in verdict.on(recorded)[0] if k.effect.kind != "parameters"]
+        if drift is not None:
+            # Fitted beside, and left out: it is none of the machine.
+            times = (here.covariates[n] for n in ("time", ROW) if n in here.covariates)
+            situation = in_time(situation, elapsed(next(times)))
+            known.append(frame_drift(situation, drift))
         loose = loose_parameters(situation.mechanism, identify)
         fine = (analysis.whitening.weight > 0) & ~analysis.near_singular
         acting, values = fit_jointly(situation, analysis.measured, known, fine, loose)
+        acting = [a for a in acting if a.effect.name != FrameDrift.name]
         used = used_covariates(situation, acting)
         situation = replace(situation, covariates={n: v for n, v in situation.covariates.items() if n in used})
         if isinstance(situation.mechanism, Instrument):
@@ -251,6 +259,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
 def _numbers(acting: Acting, said: Diagnosis) -> dict[str, float]:
     """Coefficients that were found and shapes, by name [SI]."""
     here = said.analysis.situation
-    names = [c.name for c in acting.effect.coefficients(here)] + [s.name for s in acting.effect.shapes(here)]
-    values = [*acting.coefficients.tolist(), *acting.shape.tolist()]
-    return {name: value for name, value in zip(names, values, strict=True) if value}
+    names = [c.name for c in acting.effect.coefficients(here)]
+    found = {name: value for name, value in zip(names, acting.coefficients.tolist(), strict=True) if value}
+    shapes = [s.name for s in acting.effect.shapes(here)]
+    return found | dict(zip(shapes, acting.shape.tolist(), strict=True))

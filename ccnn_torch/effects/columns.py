@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects.situation import Situation
-from ccnn_torch.mechanisms import Framed, Mechanism, Seen, SerialArm
+from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, Seen, SerialArm
 from ccnn_torch.numerics.rotations import skew
 
 _SHOWN = 1e-9
@@ -99,6 +99,8 @@ def twist_columns(situation: Situation, arm: Tensor, axes: Tensor) -> Tensor:
     """
     shift = torch.cat([axes, -skew(arm) @ axes], -1)
     turn = torch.cat([torch.zeros_like(axes), axes], -1)
+    if isinstance(situation.mechanism, Instrument):
+        return situation.by_place @ torch.cat([shift, turn], -2)
     whole = shift if situation.visible.shape[-1] == 3 else torch.cat([shift, turn], -2)
     return situation.visible @ whole
 

@@ -19,7 +19,7 @@ from ccnn_torch.effects.columns import (
 )
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import Situation, where_moved
-from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms import Mechanism, Partial, Seen, SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
 _SCALE = {"m": 1e-3, "rad": 1e-3}
@@ -39,16 +39,18 @@ class Frame(Effect):
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """As many of shift and turn as the pose shows."""
-        return tuple(Coefficient(*TWIST[k], _SCALE[TWIST[k][1]]) for k in shown_columns(situation, _frame_columns))
+        return tuple(Coefficient(*TWIST[k], _SCALE[TWIST[k][1]]) for k in shown_columns(situation, frame_columns))
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
-        return _frame_columns(situation)[..., shown_columns(situation, _frame_columns)]
+        return frame_columns(situation)[..., shown_columns(situation, frame_columns)]
 
 
-def _frame_columns(situation: Situation) -> Tensor:
+def frame_columns(situation: Situation) -> Tensor:
+    """Shifts along and turns about the axes of the base frame, `... x s x c x 6`."""
     position = situation.platform[0]
-    middle = situation.mechanism.frame(situation.mechanism.home_pose)[0]
+    machine = inside(situation.mechanism)
+    middle = machine.frame(machine.home_pose)[0]
     axes = torch.eye(3, dtype=position.dtype).expand(*position.shape, 3)
     return twist_columns(situation, position - middle, axes)
 
@@ -109,6 +111,11 @@ class Instrument(Effect):
     name = "instrument"
     kind = "pose"
     description = "the measuring device itself: errors of scale and axes that are not square"
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Measured poses."""
+        poses = not isinstance(mechanism, Seen) or isinstance(mechanism, Partial)
+        return "" if poses else f"measured poses: {mechanism.name} is seen by an instrument with parameters of its own"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Scale of each axis and shear of each pair that the pose shows; zeros and angular scales as secondary ones."""

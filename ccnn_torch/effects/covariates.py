@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects.columns import inside
-from ccnn_torch.effects.time import REFERENCE
+from ccnn_torch.effects.time import REFERENCE, ROW
 from ccnn_torch.mechanisms import Mechanism
 
 SHIFT = 8 * 3600.0
@@ -73,7 +73,7 @@ def directions(joints: Tensor, before: Tensor) -> dict[str, Tensor]:
 
 def covariate_units(mechanism: Mechanism) -> dict[str, str]:
     """SI unit of every column that the library's effects know, or the machine itself takes, by name."""
-    units = {c.name: c.unit for c in mechanism.takes} | {"time": "s", "temperature": "K"}
+    units = {c.name: c.unit for c in mechanism.takes} | {"time": "s", ROW: "1", "temperature": "K"}
     units |= {f"load_{c.name}": "N" if c.unit == "m" else "N*m" for c in inside(mechanism).pose}
     units |= {f"direction{i + 1}": "1" for i in range(len(mechanism.joints))}
     return units | {f"speed{i + 1}": f"{j.unit}/s" for i, j in enumerate(mechanism.joints)}

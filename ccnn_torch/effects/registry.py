@@ -20,7 +20,7 @@ from ccnn_torch.effects.joints import Coupling, JointGain, JointOffset, Transmis
 from ccnn_torch.effects.loads import Compliance, Gravity
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects.situation import Situation
-from ccnn_torch.effects.time import Drift, Latency, Thermal
+from ccnn_torch.effects.time import Drift, FrameDrift, Latency, Thermal
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.batching import leading_shape
@@ -345,6 +345,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "tool": Tool,
     "coupling": Coupling,
     "latency": Latency,
+    "frame_drift": FrameDrift,
     "instrument": Instrument,
 }
 """Name -> maker. The order is that of listings, and of what a verdict names where several do the very same: causes in

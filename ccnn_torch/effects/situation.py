@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ccnn_torch.mechanisms import Mechanism, Seen, SerialArm
+from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
@@ -105,6 +105,12 @@ class Situation:
             return torch.eye(rows.shape[-1], dtype=rows.dtype).expand_as(rows)
         span: Tensor = torch.linalg.qr(rows)[0]
         return span @ span.mT
+
+    @cached_property
+    def by_place(self) -> Tensor:
+        """What an instrument reads by a shift and a turn of what holds it, `... x s x c x 6`; 0 where there is none."""
+        assert isinstance(self.mechanism, Instrument)
+        return torch.nan_to_num(self.mechanism.by_place(self.joints, self.parameters, self.guess)).detach()
 
     @cached_property
     def platform(self) -> tuple[Tensor, Tensor | None]:

@@ -1,4 +1,4 @@
-"""Effects that depend on the column of times: latency, thermal growth, drift."""
+"""Effects that depend on the column of times: latency, thermal growth, drift of joints and of the measuring frame."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
+from ccnn_torch.effects.columns import TWIST, by_joint, of_rows, one_by_one, shown_columns
+from ccnn_torch.effects.constant import frame_columns
 from ccnn_torch.effects.loads import Member, members
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import Situation
@@ -333,3 +334,68 @@ def _duration(situation: Situation) -> float:
 
 def _slowing(situation: Situation) -> tuple[int, ...]:
     return tuple((2 + _WALK) * i + 1 for i in range(len(situation.mechanism.joints)))
+
+
+ROW = "row"
+"""Stands for the time where that is no input, for the measuring frame alone: time since the first row of the file [s],
+or the number of the row in the order measured."""
+_FRAME_SCALE = 1e-4
+_BEGINS = 20
+# Time constants as shares of the whole time: a step, settling, and what is nearly a line (to 0.4 % of it).
+_SETTLINGS = (0.0, 0.02, 0.06, 0.15, 0.4, 1.0, 30.0)
+
+
+class FrameDrift(Effect):
+    """Δposition = g(t) (d + ω x (position - middle of the workspace)), Δrotation = g(t) ω, in the base frame.
+
+    g goes from 0 at the time t₀ to 1 at the last row, as 1 - exp(-(t - t₀) / r): with r = 0 a step at t₀ (somebody
+    touched the stand), with r far beyond the time of all rows a line (it creeps), between them what settles (it warms
+    up). t since the first row; without a column of times its number.
+    """
+
+    name = "frame_drift"
+    kind = "pose"
+    description = "a measuring frame that moves in time: steadily, settling, or in a step"
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Time."""
+        return "" if "time" in covariates or ROW in covariates else "the time of each row: time[s]"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """How far the frame is gone at the last row; as many of shift and turn as the pose shows."""
+        return tuple(Coefficient(*TWIST[k], _FRAME_SCALE) for k in shown_columns(situation, frame_columns))
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """When it begins and how fast it settles."""
+        whole = max(float(_passed(situation).max()), 1e-6)
+        unit = "s" if "time" in situation.covariates else "1"
+        begins = tuple(whole * k / _BEGINS for k in range(_BEGINS))
+        settlings = tuple(whole * share for share in _SETTLINGS)
+        return (
+            Shape("begin", unit, begins, usual=0.0),
+            Shape("settling", unit, settlings, usual=settlings[-1]),
+        )
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x c x m`."""
+        return situation.once(self.fixed_columns) * self.column_factors(situation, shape).unsqueeze(-2)
+
+    def fixed_columns(self, situation: Situation) -> Tensor:
+        """Of the columns what does not depend on the shapes, `... x s x c x m`, to be times `column_factors`."""
+        return frame_columns(situation)[..., shown_columns(situation, frame_columns)]
+
+    def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
+        """How much of the way the frame is gone, `... x s x m`, the same in all columns."""
+        passed = _passed(situation).expand(situation.joints.shape[:-1])
+        begin, rate = (shape[..., k, None] for k in (0, 1))
+        rate = rate.clamp_min(1e-9 * float(passed.max().clamp_min(1e-6)))
+        since = passed - begin
+        gone = -torch.expm1(-since.clamp_min(0.0) / rate)
+        whole = -torch.expm1(-(passed.amax(-1, keepdim=True) - begin).clamp_min(1e-300) / rate)
+        share = (gone / whole).unsqueeze(-1)
+        return share.expand(*share.shape[:-1], len(self.coefficients(situation)))
+
+
+def _passed(situation: Situation) -> Tensor:
+    """Time since the first row, or rows since, `... x s`."""
+    return elapsed(situation.covariates["time"]) if "time" in situation.covariates else situation.covariates[ROW]

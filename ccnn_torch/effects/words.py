@@ -91,6 +91,13 @@ _WORDS = {
         "",
         "Clamping of base, part and measuring device, and the warm-up of {where}.",
     ),
+    "frame_drift": Words(
+        "a measuring frame that moves in time",
+        "drift of the measuring frame",
+        "How far the frame is gone at the last row, about the middle of the workspace. It is none of the machine: "
+        "commands are not corrected for it.",
+        "The stand of the measuring device and the clamping of the base: what creeps, warms up or was touched.",
+    ),
     "frame": Words(
         "a shifted or tilted base frame",
         "base frame off",

@@ -35,7 +35,7 @@ from ccnn_torch.identification.solve import (
     select,
     solver_of,
 )
-from ccnn_torch.mechanisms import Framed, Mechanism, Seen
+from ccnn_torch.mechanisms import Framed, Mechanism, Seen, SetUps
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
@@ -69,9 +69,12 @@ class Identification:
     given: Given | None = None
 
     def mechanism(self, machine: int = 0, method: str | None = None) -> Mechanism:
-        """The mechanism with the identified parameters of one machine; by default the first method's."""
+        """The mechanism with the identified parameters of one machine; by default the first method's.
+
+        Of an arm that was measured in several set-ups the frames are those of the first one.
+        """
         outcome = self.outcomes[method or next(iter(self.outcomes))]
-        return self.measured.mechanism.with_nominal(outcome.values[machine])
+        return _one(self.measured.mechanism, outcome.values[machine])
 
     def save(self, folder: str | Path) -> None:
         """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`."""
@@ -88,8 +91,12 @@ class Identification:
 
     def nominal(self) -> dict[str, float]:
         """What the parameters were before, by name [SI]: nominal, or with the frames fitted."""
-        names = [p.name for p in self.measured.mechanism.geometry]
-        return dict(zip(names, self.measured.start[0].tolist(), strict=True))
+        before = _one(self.measured.mechanism, self.measured.start[0])
+        return dict(zip((p.name for p in before.geometry), before.nominal.tolist(), strict=True))
+
+
+def _one(mechanism: Mechanism, values: Tensor) -> Mechanism:
+    return mechanism.one(values) if isinstance(mechanism, SetUps) else mechanism.with_nominal(values)
 
 
 def prepare(config: IdentifyConfig, given: Given | None = None) -> tuple[Mechanism, Measured]:

@@ -232,6 +232,10 @@ def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | 
             f"transfer: {mechanism.name} has no frame to be fitted anew; it takes a serial arm whose base_frame or "
             "tool_frame is unknown"
         )
+    if mechanism.frame_per or mechanism.tool_per:
+        raise InputError(
+            "transfer: takes an arm with one frame for all rows; remove frame_per and tool_per, or transfer"
+        )
     records, arm = read_records(config, config.transfer, mechanism)
     assert isinstance(arm, SerialArm)
     return Elsewhere(arm, *rows_of_split(records, split_records(config, records)))

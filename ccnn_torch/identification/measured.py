@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.config.sizes import sizes_of_joints, sizes_of_pose
@@ -17,9 +20,11 @@ from ccnn_torch.mechanisms import (
     Mechanism,
     SerialArm,
     as_measured,
+    fit_frames,
     fit_unknown,
     judge_frames,
     load_mechanism,
+    set_ups,
 )
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.records import Records, check_rows, load_records
@@ -95,6 +100,10 @@ class Rows:
         """The rows of some machines."""
         return Rows(self.joints[machines], self.observed[machines])
 
+    def in_set_ups(self, numbers: Tensor) -> Rows:
+        """The rows of an arm in set-ups, whose numbers `s` are the last of the joints (`SetUps`)."""
+        return replace(self, joints=torch.cat([self.joints, numbers.to(self.joints.dtype)[None, :, None]], -1))
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -159,11 +168,20 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
     records, mechanism = read_records(config, source, mechanism)
     split = split_records(config, records)
     train, test = rows_of_split(records, split)
-    start = _start(mechanism, train)
-    far = []
+    columns = {name: values[split.train.numpy()] for name, values in records.columns.items()}
+    start, far = _start(mechanism, train, columns), list[str]()
     if isinstance(mechanism, SerialArm):
         far = judge_frames(mechanism, train.joints[0], train.observed[0], start, where=records.path)
-    joint_noise = config.joint_noise
+    joint_noise = None
+    if config.joint_noise is not None:
+        joint_noise = sizes_of_joints(config.joint_noise, mechanism.joints, "joint_noise")
+    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+        mechanism, number, groups = set_ups(mechanism, records.columns, len(records))
+        _refuse_unseen(groups, split, records)
+        train, test = (rows.in_set_ups(number[i]) for rows, i in ((train, split.train), (test, split.test)))
+        start = mechanism.parameters_of(start[0], number[split.train])[None]
+        # The number of a set-up has no noise.
+        joint_noise = None if joint_noise is None else torch.nn.functional.pad(joint_noise, (0, 1))
     return Measured(
         mechanism=mechanism,
         kinematics=Kinematics(mechanism),
@@ -172,7 +190,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         test=test,
         start=start,
         pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),
-        joint_noise=None if joint_noise is None else sizes_of_joints(joint_noise, mechanism.joints, "joint_noise"),
+        joint_noise=joint_noise,
         data_hash=records.data_hash,
         notes=[*held_out_notes(config.split, len(split.test), split), *_notes(records), *far],
     )
@@ -181,11 +199,6 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
 def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[Records, Mechanism]:
     """Records that fit a mechanism, and the mechanism as it was measured there (of its pose all, or a part)."""
     records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
-    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
-        raise InputError(
-            f"{config.mechanism}: frame_per and tool_per give each group of rows a frame of its own; remove them to "
-            "identify one machine, or identify from the rows of one group"
-        )
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path)
     if not config.frame.base and not config.frame.tool:
         check_rows(records, mechanism)
@@ -216,12 +229,28 @@ def rows_of_split(records: Records, split: Split) -> tuple[Rows, Rows]:
     return train, test
 
 
-def _start(mechanism: Mechanism, rows: Rows) -> Tensor:
-    """Where the search starts, `1 x K`: what is unknown of frames and instruments has to be fitted first."""
+def _start(mechanism: Mechanism, rows: Rows, columns: Mapping[str, NDArray[np.float64]]) -> Tensor:
+    """Where the search starts, `1 x K`, `1 x s x K` with frames by group: what is unknown is fitted first.
+
+    columns: of the rows, which number the groups.
+    """
+    about = mechanism, rows.joints[0], rows.observed[0]
     fitted = None
-    if not isinstance(mechanism, Framed):
-        fitted = fit_unknown(mechanism, rows.joints[0], rows.observed[0])
+    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+        fitted = fit_frames(*about, columns=columns)
+    elif not isinstance(mechanism, Framed):
+        fitted = fit_unknown(*about)
     return (mechanism.nominal if fitted is None else fitted)[None].clone()
+
+
+def _refuse_unseen(groups: Sequence[tuple[str, Tensor]], split: Split, records: Records) -> None:
+    """Raise InputError where a group of rows with a frame of its own has none to identify from."""
+    for name, rows in groups:
+        if not bool(rows[split.train].any()):
+            raise InputError(
+                f"{records.path}: {name} has {int(rows.sum())} held-out rows but none to identify from, so that its "
+                "frame is not known; write split.kind=random or a smaller split.test, or leave these rows out"
+            )
 
 
 def _notes(records: Records) -> list[str]:

@@ -271,8 +271,8 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
     """Refuse rows that the mechanism cannot have reached.
 
     With known frames a row must be `mechanism.reachable(pose)`, where the mechanism has that method. An arm with
-    `unknown_frames` can only be judged by its size: no position may be farther from the median position than twice
-    `mechanism.reach` [m], to which a quarter is added for the tool where that is unknown too.
+    `unknown_frames` can only be judged by its size: no position may be farther from the median position (of its group
+    of `frame_per`) than twice `mechanism.reach` [m], to which a quarter is added for the tool where it is unknown too.
 
     Raises:
         InputError: names the rows.
@@ -294,7 +294,14 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
     if reach is None or positions.shape[1] == 0:
         return
     limit = 2 * float(reach) * (1 + _TOOL_ALLOWANCE * ("tool" in unknown))
-    distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    # Another base frame may be anywhere.
+    keys = [records.columns[name] for name in getattr(mechanism, "frame_per", ()) if name in records.columns]
+    group = np.zeros(len(positions))
+    if keys:
+        group = np.unique(np.stack(keys, -1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.float64)
+    distance = np.zeros(len(positions))
+    for mine in (group == one for one in np.unique(group)):
+        distance[mine] = np.linalg.norm(positions[mine] - np.median(positions[mine], axis=0), axis=1)
     outside = np.flatnonzero(distance > limit)
     if len(outside):
         far = f"{distance[outside[0]]:.3g} m from the median position"

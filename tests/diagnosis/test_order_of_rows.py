@@ -7,8 +7,13 @@ from dataclasses import replace
 import torch
 from _machines import measured, rows_of
 
-from ccnn_torch.diagnosis.checks.unrecorded import directions_of_order
+from ccnn_torch.diagnosis.checks.unrecorded import measured_order, of_order
 from ccnn_torch.diagnosis.engine import diagnose_rows
+from ccnn_torch.effects import Situation
+
+
+def directions_of_order(situation: Situation) -> dict[str, torch.Tensor]:
+    return of_order(situation)["direction"].columns(situation, measured_order(situation))
 
 
 def test_directions_follow_the_time_and_last_while_a_joint_stands_still() -> None:
@@ -19,7 +24,8 @@ def test_directions_follow_the_time_and_last_while_a_joint_stands_still() -> Non
     assert directions_of_order(here)["direction2"].tolist() == [0, 0, 1, 1]
     turned = replace(here, joints=joints.flip(0), covariates={"time": torch.arange(4.0).flip(0).double()})
     assert directions_of_order(turned)["direction1"].tolist() == [-1, 1, 1, 0]
-    assert directions_of_order(replace(here, covariates={"direction2": joints[:, 0]})) == {}
+    assert set(of_order(replace(here, covariates={"direction2": joints[:, 0]}))) == {"row"}
+    assert not of_order(replace(here, covariates={"direction2": joints[:, 0], "time": joints[:, 1]}))
 
 
 def test_backlash_is_named_by_directions_from_the_order_of_the_rows() -> None:

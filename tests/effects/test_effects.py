@@ -41,7 +41,7 @@ def test_the_example_of_an_own_effect_keeps_it_too() -> None:
 def test_the_library_has_its_order_and_a_line_for_people() -> None:
     assert list(EFFECTS) == [
         *("geometry", "joint_offset", "joint_gain", "transmission", "backlash", "friction", "compliance", "gravity"),
-        *("thermal", "drift", "frame", "tool", "coupling", "latency", "instrument"),
+        *("thermal", "drift", "frame", "tool", "coupling", "latency", "frame_drift", "instrument"),
     ]
     assert OUTLIER not in EFFECTS
     for name in EFFECTS:

@@ -7,11 +7,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ccnn_torch.calibration.geometry.frame_drift import moments
 from ccnn_torch.calibration.rows.dataset import rows_of
-from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, usable_verdict
+from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, in_time, usable_verdict
 from ccnn_torch.diagnosis.from_records import situation_of
 from ccnn_torch.diagnosis.joint_fit import effects_that_pay, fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.effects import make_effect
+from ccnn_torch.effects.time import FrameDrift
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm
 from ccnn_torch.records import Records
@@ -20,7 +22,8 @@ from ccnn_torch.records import Records
 _MOST_ROWS = 1000
 _EFFECTS = ("joint_gain", "transmission", "backlash", "friction", "compliance", "gravity", "thermal", "coupling")
 """What is looked for where nothing is asked: all of the library that acts within the machine and that a command can
-know. Frames and geometry are fitted beside; an error of the measuring device is none of the machine."""
+know. Frames and geometry are fitted beside, and a drift of the measuring frame where the rows have times; an error of
+the measuring device is none of the machine."""
 
 
 def search_effects(
@@ -43,24 +46,28 @@ def search_effects(
         return None, ["Effects were not searched: one compensator needs one frame, and these rows have several."]
     if len(rows) > _MOST_ROWS:
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]
-    few = rows_of(records, rows.sort().values)
+    rows = rows.sort().values
+    few = rows_of(records, rows)
     try:
         recorded = situation_of(few, mechanism)
     except InputError as reason:
         return None, [f"Effects were not searched: {reason}"]
     made = [make_effect(name, mechanism) for name in _EFFECTS if names is None or name in names]
     made += [make_effect(name, mechanism) for name in names or () if name not in _EFFECTS]
-    asked = [e for e in made if not (identify and e.kind == "parameters")]
+    asked = [e for e in made if not (identify and e.kind == "parameters") and e.name != FrameDrift.name]
     asked = [e for e in asked if names is not None or not e.missing(mechanism, [*recorded.covariates])]
     named = Verdict(TRAINING_ROWS, recorded.gravity, tuple((e.name, {}) for e in asked))
     usable, notes = usable_verdict(named, recorded)
     notes = notes if names is not None else []
     situation = on_fitted_frames(recorded)
+    # What drifts by the time of the rows is not taken for what their joints or loads do.
+    drifts = "time" in records.columns if names is None else FrameDrift.name in names
+    situation = in_time(situation, moments(records)[rows]) if drifts else situation
     fine = torch.isfinite(situation.pose).all(-1)
     if not bool(fine.any()):
         return None, [f"Effects were not searched: {mechanism.name} takes none of the training rows."]
     kept = () if usable is None else tuple(name for name, _ in usable.effects)
-    effects = [e for e in asked if e.name in kept]
+    effects = [e for e in asked if e.name in kept] + ([FrameDrift()] if drifts else [])
     loose = loose_parameters(situation.mechanism, identify)
     known = effects_that_pay(situation, few.pose, effects, fine, loose) if effects else []
     if not known:

@@ -176,10 +176,7 @@ def fit_physics(
     known, notes = list[Known](), list[str]()
     if verdict is not None:
         _refuse_lacking(verdict, mechanism, records)
-        known, notes = verdict.on(replace(rows, parameters=None))
-        if identify and any(k.effect.kind == "parameters" for k in known):
-            known = [k for k in known if k.effect.kind != "parameters"]
-            notes.append("The verdict's geometry is left to geometry=identify, which fits all parameters.")
+        known, notes = verdict.on(replace(rows, parameters=None), identify)
     situations, every, values, fitted_to = [], [], [], []
     for k, split in enumerate(splits):
         base = None if parameters is None else parameters[k, 0]
@@ -202,7 +199,7 @@ def fit_physics(
             "drawn to its nominal value by a plausible error; the network learns only what they leave."
         )
     source = "" if verdict is None else short_path(verdict.path)
-    if verdict is not None:
+    if verdict is not None and known:
         named = ", ".join(dict.fromkeys(k.effect.name for k in known))
         fitted_anew = "Their coefficients were fitted anew to the training rows of each repeat"
         seen = "; their periods and other shapes are the file's, which may have seen the held-out rows"

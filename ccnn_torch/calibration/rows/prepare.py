@@ -16,6 +16,7 @@ from torch import Tensor
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.geometry.choice import ModelChoice, choose_model
 from ccnn_torch.calibration.geometry.effects_search import search_effects
+from ccnn_torch.calibration.geometry.frame_drift import without_frame_drift
 from ccnn_torch.calibration.geometry.frames import frames_of_repeats
 from ccnn_torch.calibration.geometry.physics import Physics, fit_physics, verdict_of
 from ccnn_torch.calibration.rows.dataset import Dataset, by_repeat, dataset_of
@@ -220,7 +221,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     pose = completed(mechanism, records.joints, records.pose)
     splits = _splits(config, mechanism.frame(pose)[0], records.columns, seeds, held, records.joints)
     settings = _pseudoerror_settings(config, mechanism)
-    choice, verdict, said = _choice(config, mechanism, records, splits[0], settings, verdict)
+    choice, verdict, records, said = _choice(config, mechanism, records, splits[0], settings, verdict)
     notes = [*doubts, *records.notes, *said, choice.why]
     prepared = _fitted_to(Source(mechanism, records, settings, choice, verdict), splits, seeds)
     notes = [*held_out_notes(config.split, len(splits[0].test), splits[0]), *notes, *prepared.notes]
@@ -283,17 +284,20 @@ def _choice(
     split: Split,
     settings: dict[str, Any],
     verdict: Verdict | None,
-) -> tuple[ModelChoice, Verdict | None, list[str]]:
-    """What `geometry` and `effects` come to for these records, the effects, and notes."""
+) -> tuple[ModelChoice, Verdict | None, Records, list[str]]:
+    """What `geometry` and `effects` come to for these records, the effects, the records less what is none of the
+    machine, and notes."""
     notes: list[str] = []
+    rows, identify = torch.cat([split.train, split.validation]), config.geometry != "none" and bool(mechanism.geometry)
     asked = verdict is not None
     if config.effects != "none" and not asked:
         names = None if isinstance(config.effects, str) else config.effects
-        rows = torch.cat([split.train, split.validation])
-        identify = config.geometry != "none" and bool(mechanism.geometry)
         verdict, notes = search_effects(mechanism, records, rows, names, config.seed, identify)
         if config.repeats > 1 and verdict is not None:
             notes.append("They were searched in the training rows of the first repeat, for all repeats.")
+    if verdict is not None:
+        records, verdict, said = without_frame_drift(mechanism, records, rows, verdict, identify)
+        asked, notes = asked and verdict is not None, [*notes, *said]
     about = (
         split,
         config.split.kind,
@@ -305,7 +309,7 @@ def _choice(
         method_names(config, "") == [""],
     )
     choice = choose_model(mechanism, records, *about)
-    return choice, verdict if choice.effects else None, notes
+    return choice, verdict if choice.effects else None, records, notes
 
 
 def damping_of(config: RunConfig, mechanism: Mechanism) -> float:

@@ -23,6 +23,7 @@ from ccnn_torch.diagnosis.verdict.judgement import Judgement, implausible_size
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
+from ccnn_torch.effects.time import ROW
 from ccnn_torch.evidence.dictionary import covariance
 from ccnn_torch.evidence.judge import BESIDE_UNKNOWN
 from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
@@ -89,10 +90,16 @@ def cautions(
 
 def of_inferred(names: Sequence[str]) -> Caution:
     """Covariates that were taken from the order of the rows, which may not be that in which they were measured."""
-    columns = ", ".join(f"{name}[1]" for name in names)
+    lacking, record = [], []
+    if signs := [f"{name}[1]" for name in names if name != ROW]:
+        lacking.append("directions of approach")
+        record.append(f"{', '.join(signs)} (the sign of each joint's last motion)")
+    if ROW in names:
+        lacking.append("times")
+        record.append("time[s]")
     return Caution(
-        "no directions of approach are among the covariates; they were taken from the order of the rows: record "
-        f"{columns} (the sign of each joint's last motion)"
+        f"no {' and no '.join(lacking)} are among the covariates; they were taken from the order of the rows: record "
+        f"{' and '.join(record)}"
     )
 
 

@@ -1,12 +1,12 @@
-"""What was not recorded: covariates and the effects that they would show, and directions from the order of the rows."""
+"""What was not recorded: covariates and the effects that they would show; what the order of the rows tells of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import combinations
-from typing import Any
+from itertools import combinations, product
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Effect, Situation, pose_residual
 from ccnn_torch.effects.backlash import Backlash
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
+from ccnn_torch.effects.time import ROW, FrameDrift
 from ccnn_torch.errors import InputError
 from ccnn_torch.evidence.dictionary import gain_beside
 
@@ -99,55 +100,84 @@ def _usual(change: Tensor, position: bool) -> float:
     return float(block.square().flatten(1).sum(1).median().sqrt())
 
 
-# Log odds that the directions must gain beside the verdict, and beyond twice what those of as many random orders gain:
-# in any order a row far out was reached from further in, so that directions follow the place a little.
-_CLEARLY, _ORDERS = 10.0, 4
-_EFFECT = Backlash()
+# Log odds that directions, and numbers of rows, must gain beside the verdict, and beyond so many times what those of as
+# many random orders gain: in any order a row far out was reached from further in, so that directions follow the place a
+# little. Numbers of rows are then asked beside everything else.
+_DIRECTIONS, _ROWS_IN_ORDER, _ORDERS = (10.0, 2.0), (5.0, 1.0), 4
 
 
-def directions_of_order(situation: Situation) -> dict[str, Tensor]:
-    """Sign of each joint's way from the row before, `s` each, by the names of their columns; {} where one is recorded.
+class OfOrder(NamedTuple):
+    """Columns that the order of the rows tells where they were not recorded.
 
-    Rows are in the order of their time where that was recorded, else in that of the file. A joint that stands still
-    keeps its sign; before its first motion it is 0.
-
-    Args:
-        situation: all rows of the file.
+    Attributes:
+        effect: what they would show.
+        columns: of rows and an order of theirs, by name, `s` each.
+        clearly: log odds that they must gain, and times what random orders gain.
+        every: of each grid of its shapes every so many values are tried, from the first on; () = the middle ones.
     """
+
+    effect: Effect
+    columns: Callable[[Situation, Tensor], dict[str, Tensor]]
+    clearly: tuple[float, float]
+    every: tuple[int, ...] = ()
+
+    def signatures(self, there: Situation) -> list[Tensor]:
+        """Of the effect at each of the shapes tried, `s x c x m` each; there: rows with the columns."""
+        shapes = [default_shape(there, self.effect)]
+        if self.every:
+            grids = [s.grid[::n] for s, n in zip(self.effect.shapes(there), self.every, strict=True)]
+            shapes = [torch.tensor(values, dtype=torch.float64) for values in product(*grids)]
+        return [scaled_signature(there, self.effect, shape) for shape in shapes]
+
+
+def of_order(situation: Situation) -> dict[str, OfOrder]:
+    """Kinds of columns that are not there: `direction`, and `row`, which stands for the time."""
+    found = {} if situation.directed else {"direction": OfOrder(Backlash(), _directions, _DIRECTIONS)}
+    return (
+        found
+        if "time" in situation.covariates
+        else found | {ROW: OfOrder(FrameDrift(), _numbers, _ROWS_IN_ORDER, (5, 3))}
+    )
+
+
+def measured_order(situation: Situation) -> Tensor:
+    """The rows, `s`, by their time where that was recorded, else as in the file."""
     time = situation.covariates.get("time")
-    order = torch.arange(len(situation.joints)) if time is None else time.argsort(stable=True)
-    return {} if situation.directed else _by_name(_signs(situation.joints, order))
+    return torch.arange(len(situation.joints)) if time is None else time.argsort(stable=True)
 
 
-def order_shows(analysis: Analysis, judgement: Judgement, directions: Mapping[str, Tensor]) -> bool:
-    """Whether what a verdict leaves follows these directions.
+def order_shows(analysis: Analysis, judgement: Judgement, columns: Mapping[str, Tensor], kind: OfOrder) -> bool:
+    """Whether what a verdict leaves follows these columns, far more than those of the same rows in random orders.
 
     Args:
         analysis: of the rows.
         judgement: the verdict without them.
-        directions: of the same rows, `s` each; {} = none.
+        columns: of the same rows, `s` each.
+        kind: what made them.
     """
-    if not directions:
-        return False
-    drawn = torch.Generator().manual_seed(0)
-    orders = [torch.randperm(len(analysis.residual), generator=drawn) for _ in range(_ORDERS)]
-    every = []
-    for signs in (directions, *(_by_name(_signs(analysis.situation.joints, order)) for order in orders)):
-        there = replace(analysis.situation, covariates={**analysis.situation.covariates, **signs})
-        every.append(scaled_signature(there, _EFFECT, default_shape(there, _EFFECT)))
-    gain, *by_chance = gain_beside(analysis.dictionary, judgement.found, analysis.whitened(every))
-    return gain > _CLEARLY + 2 * max(0.0, *by_chance)
+    situation, drawn = analysis.situation, torch.Generator().manual_seed(0)
+    orders = (torch.randperm(len(analysis.residual), generator=drawn) for _ in range(_ORDERS))
+    gain, *by_chance = (
+        max(gain_beside(analysis.dictionary, judgement.found, analysis.whitened(kind.signatures(there))))
+        for own in (columns, *(kind.columns(situation, order) for order in orders))
+        for there in [situation.with_covariates({**situation.covariates, **own})]
+    )
+    alone, times = kind.clearly
+    return gain > alone + times * max(0.0, *by_chance)
 
 
-def _signs(joints: Tensor, order: Tensor) -> Tensor:
-    """Sign of each joint's way from the row before in an order of the rows, `s x n`."""
-    way = joints[order].diff(dim=0, prepend=joints[order[:1]]).sign()
+def _directions(situation: Situation, order: Tensor) -> dict[str, Tensor]:
+    """Sign of each joint's way from the row before in an order of the rows.
+
+    A joint that stands still keeps its sign; before its first motion it is 0.
+    """
+    way = situation.joints[order].diff(dim=0, prepend=situation.joints[order[:1]]).sign()
     rows = torch.arange(len(way))[:, None].expand_as(way)
     last = torch.where(way != 0, rows, 0).cummax(0).values
-    signs = torch.empty_like(joints)
+    signs = torch.empty_like(situation.joints)
     signs[order] = way.gather(0, last)
-    return signs
-
-
-def _by_name(signs: Tensor) -> dict[str, Tensor]:
     return {f"direction{i + 1}": way for i, way in enumerate(signs.unbind(-1))}
+
+
+def _numbers(situation: Situation, order: Tensor) -> dict[str, Tensor]:
+    return {ROW: order.argsort().to(situation.joints.dtype)}

@@ -28,6 +28,9 @@ _MAIN, _MENDED = 0.5, 15.0
 _IMPLAUSIBLE = 250.0
 # What a set does in a direction, against what it does in its strongest one, below which that is of second order.
 _SECOND_ORDER = 1e-4
+# Rank correlation with the time from which a joint was moved one way while the rows were measured.
+_ONE_WAY = 0.9
+_OF_TIME = frozenset({"drift", "frame_drift"})
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ def judge_rows(analysis: Analysis) -> Judgement:
     if verdict.outside:
         drivers = drivers or next((d for f in usual.found if (d := _named(analysis, f)[1])), ())
         drivers += _second_driver(analysis, usual, found)
+        drivers = _time_first(analysis, drivers, leading)
     # The coefficients of effects that cannot be distinguished are not identifiable together, nor those of an effect
     # that does nothing that the others cannot do.
     alike = {name for some in verdict.classes.values() for name in some} - names
@@ -162,6 +166,24 @@ def _in_order_of_library(
         return verdict
     probability = max(verdict.probability, min(sum(e.probability for e in same), 1.0))
     return replace(verdict, chosen=told, classes=classes_of(every, told.names), probability=probability)
+
+
+def _time_first(
+    analysis: Analysis, drivers: tuple[str, ...], explanations: Sequence[Explanation[FittedSet]]
+) -> tuple[str, ...]:
+    """Time before a joint that was moved one way while the rows were measured, where both explain what is left."""
+    situation, first = analysis.situation, next(iter(drivers), "")
+    joint = next((i for i, j in enumerate(situation.mechanism.joints) if first == f"joint {j.name}"), None)
+    if joint is None or "time" not in situation.covariates:
+        return drivers
+    ranks = torch.stack(
+        [v.argsort().argsort().double() for v in (situation.covariates["time"], situation.joints[:, joint])]
+    )
+    own = max((e.probability for e in explanations if first in e.drivers), default=1.0)
+    by_time = (e for e in explanations if "time" in e.drivers or e.names & _OF_TIME)
+    if abs(float(torch.corrcoef(ranks)[0, 1])) < _ONE_WAY or all(e.probability * ODDS < own for e in by_time):
+        return drivers
+    return ("time", *(d for d in drivers if d != "time"))
 
 
 def without_names(analysis: Analysis, judgement: Judgement) -> Judgement:

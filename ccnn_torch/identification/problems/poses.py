@@ -22,9 +22,8 @@ from ccnn_torch.identification.problems.whitened import (
     gather_rows,
     whitened_problem,
 )
-from ccnn_torch.mechanisms import Mechanism, Seen
+from ccnn_torch.mechanisms import Mechanism, Seen, SerialArm, SetUps
 from ccnn_torch.mechanisms.frames.partial import completed
-from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
@@ -185,7 +184,7 @@ def forward_problem(
 
     def difference(full: Tensor, q: Tensor, x: Tensor, *measured: Tensor) -> Tensor:
         """In the order of `order`."""
-        if isinstance(mechanism, SerialArm) and turning:
+        if isinstance(mechanism, SerialArm | SetUps) and turning:
             position, rotation = mechanism.forward_frame(q, full)
         else:
             there = mechanism.forward_kinematics(q, full, x)

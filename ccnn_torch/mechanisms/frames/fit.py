@@ -208,8 +208,8 @@ def fit_frames(
     lead = weights.shape[:-1]
     if not arm.unknown_frames:
         return arm.nominal.expand(*lead, *([len(joints)] if grouped else []), -1).clone()
-    base_of, base_names = _groups(arm, "frame_per", arm.frame_per, columns, len(joints))
-    tool_of, tool_names = _groups(arm, "tool_per", arm.tool_per, columns, len(joints))
+    base_of, base_names = groups_of(arm, "frame_per", arm.frame_per, columns, len(joints))
+    tool_of, tool_names = groups_of(arm, "tool_per", arm.tool_per, columns, len(joints))
     needed = 3 if grouped or arm.orientation == "rotation_vector" else 5
     for group_of, names in ((base_of, base_names), (tool_of, tool_names)):
         _check_rows(arm, weights, group_of, names, needed)
@@ -285,7 +285,7 @@ def _pick(values: Tensor, best: Tensor) -> Tensor:
     return values.gather(0, index.expand(1, *values.shape[1:]))[0]
 
 
-def _groups(
+def groups_of(
     arm: SerialArm, key: str, names: Sequence[str], columns: Mapping[str, NDArray[np.float64]] | None, rows: int
 ) -> tuple[Tensor, list[str]]:
     """Group number of each row, `s` int64, and what each group is called."""

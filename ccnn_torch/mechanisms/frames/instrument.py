@@ -109,6 +109,22 @@ class Instrument(Seen):
             return read, None
         return torch.zeros_like(read), rotation_vector_to_matrix(read)
 
+    def by_place(self, joints: Tensor, parameters: Tensor | None, guess: Tensor | None) -> Tensor:
+        """Change of `frame` by a shift and a turn (about its own point) of what holds the instrument, `... x c x 6`."""
+        values, count = self.resolve(parameters), len(self.mechanism.geometry)
+        there = place_of(self.mechanism, self.link, joints, values[..., :count])
+        given = (self.home_pose if guess is None else guess)[..., self.compared :]
+
+        def read(twist: Tensor) -> Tensor:
+            turned = there.rotation
+            if turned is not None:
+                turned = rotation_vector_to_matrix(twist[..., 3:]) @ turned
+            return self.reading(Place(there.position + twist[..., :3], turned, joints), values[..., count:], given)
+
+        slope = jacobian_of(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype))[1]
+        slope = torch.nn.functional.pad(slope, (0, 0, 0, 3 - self.compared))
+        return slope if self.pose[0].unit == "m" else torch.cat([torch.zeros_like(slope), slope], -2)
+
     def fitted(self, joints: Tensor, pose: Tensor, weights: Tensor | None = None) -> Tensor:
         """All parameters, those of `unknown_frames` fitted to rows, the rest nominal.
 
