@@ -11,7 +11,7 @@ from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.effects.columns import TWIST, caused_by, own_parameters, parameter_columns, shown_columns, twist_columns
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import Situation, where_moved
-from ccnn_torch.mechanisms import Mechanism, Partial, SerialArm
+from ccnn_torch.mechanisms import Mechanism, Partial, SerialArm, sees_directions
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
 _SCALE = {"m": 1e-3, "rad": 1e-3}
@@ -56,6 +56,8 @@ class Tool(Effect):
         """A platform that turns, and a tool frame that is known; an unknown one is fitted before anything else."""
         if "tool" in getattr(mechanism, "unknown_frames", ()):
             return f"a known tool frame: that of {mechanism.name} is fitted to the records anyhow"
+        if sees_directions(mechanism):
+            return "positions: to directions a shift of the tool is an error of the last link"
         whole = mechanism.mechanism if isinstance(mechanism, Partial) else mechanism
         if not isinstance(whole, SerialArm) and whole.frame(whole.home_pose)[1] is None:
             return "a platform that turns: on this one a shift of the tool is a shift of the frame"
@@ -101,6 +103,10 @@ class Instrument(Effect):
     name = "instrument"
     kind = "pose"
     description = "the measuring device itself: errors of scale and axes that are not square"
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Positions."""
+        return "positions: directions have no scale" if sees_directions(mechanism) else ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Scale of each axis and shear of each pair that the pose shows; zeros and angular scales as secondary ones."""

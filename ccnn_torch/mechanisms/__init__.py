@@ -8,7 +8,11 @@ if TYPE_CHECKING:
     from ccnn_torch.mechanisms.frames.fit import fit_frames as fit_frames
     from ccnn_torch.mechanisms.frames.framed import Framed as Framed
     from ccnn_torch.mechanisms.frames.judge import judge_frames as judge_frames
-    from ccnn_torch.mechanisms.frames.partial import Partial as Partial, as_measured as as_measured
+    from ccnn_torch.mechanisms.frames.partial import (
+        Partial as Partial,
+        as_measured as as_measured,
+        sees_directions as sees_directions,
+    )
     from ccnn_torch.mechanisms.machines.delta import Delta as Delta, DeltaLinear as DeltaLinear
     from ccnn_torch.mechanisms.machines.five_bar import FiveBar as FiveBar
     from ccnn_torch.mechanisms.machines.overconstrained import Overconstrained2Dof as Overconstrained2Dof

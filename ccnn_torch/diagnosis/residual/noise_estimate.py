@@ -8,7 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.residual.whitening import MAD, NO_NOISE, Whitening, renewed
+from ccnn_torch.diagnosis.residual.whitening import (
+    MAD,
+    NO_NOISE,
+    Whitening,
+    renewed,
+)
 from ccnn_torch.evidence.marginal_likelihood import (
     NO_COLUMNS,
     Axes,
@@ -36,7 +41,12 @@ _KNOWN = 50.0
 
 
 def fitted_whitening(
-    residual: Tensor, columns: Sequence[Tensor], channels: Tensor, noise: Tensor | None, usable: Tensor
+    residual: Tensor,
+    columns: Sequence[Tensor],
+    channels: Tensor,
+    noise: Tensor | None,
+    usable: Tensor,
+    axes: Tensor | None = None,
 ) -> Whitening:
     """Noise and row weights from the largest model: of everything that may be there, one by one what explains most of
     what is left, as long as the evidence for it is more than slight.
@@ -47,17 +57,17 @@ def fitted_whitening(
         channels: `c`.
         noise: known standard deviation of each of the c0 channels, or None.
         usable: `s`, False where a row is left out from the start.
+        axes: of the device, as in `Whitening`.
     """
-    rms = residual[usable][:, channels].abs().median(0).values * MAD
-    rms = rms.clamp_min(NO_NOISE)
-    sigma = rms if noise is None else noise[channels]
-    white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0 if noise is None else _KNOWN)
-    shown = [c if len(channels) == c.shape[1] else c[:, channels] for c in columns if c.shape[-1]]
-    shown = [c.to(residual.dtype) for c in shown]
-    every = _Everything(shown, white)
-    y = residual[:, channels]
+    given, known = (residual.new_ones(residual.shape[-1]), 0.0) if noise is None else (noise, _KNOWN)
+    white = Whitening(channels, given[channels], usable.to(residual.dtype), known, axes)
+    y = white.picked(residual)
+    shown = [white.picked(c).to(residual.dtype) for c in columns if c.shape[-1]]
     if noise is None:
-        white = replace(white, sigma=sigma * _noise_share(every, y, white).sqrt())
+        white = replace(white, sigma=(y[usable].abs().median(0).values * MAD).clamp_min(NO_NOISE))
+    every = _Everything(shown, white)
+    if noise is None:
+        white = replace(white, sigma=white.sigma * _noise_share(every, y, white).sqrt())
     chosen: list[int] = []
     log_scale = y.new_zeros(1, 0)
     left, free = y, 1.0

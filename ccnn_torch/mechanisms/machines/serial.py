@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -121,6 +122,10 @@ def compose(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tupl
 MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
 
+MOUNT = ({"alpha": "NPAE", "theta": "IA"}, {"d": "CA", "theta": "IE"})
+"""What astronomers call the parameters of the two links of a mount: axes that are not square, zero of the first joint,
+collimation (over the length of the tube), zero of the second joint."""
+
 FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
 
@@ -135,7 +140,8 @@ class SerialArm(Mechanism):
         unknown_frames: those of "base" and "tool" that must be fitted to records first (`frames.fit_frames`).
         frame_per, tool_per: record columns that number the groups with a base or tool frame of their own.
         parallel_axes: groups of joints (counted from 1) with parallel axes.
-        orientation: "rotation_vector", or "none": the pose is x, y, z alone.
+        orientation: "rotation_vector"; "none": the pose is x, y, z alone; or "direction": these are the unit vector in
+            which the tool looks, so that only lengths behind the last axis count, and a shift of the base does nothing.
         rotation_weight: [m/rad].
     """
 
@@ -144,6 +150,7 @@ class SerialArm(Mechanism):
     signs: Tensor
     revolute: Tensor
     limits: Tensor
+    counting: Tensor
 
     def __init__(
         self,
@@ -182,15 +189,15 @@ class SerialArm(Mechanism):
             InputError: unknown convention or orientation.
         """
         keys = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        if convention not in LINKS or orientation not in ("rotation_vector", "none"):
+        if convention not in LINKS or orientation not in ("rotation_vector", "none", "direction"):
             raise InputError(
-                f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector' or 'none'; "
-                f"got '{convention}', '{orientation}'"
+                f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector', 'none' or "
+                f"'direction'; got '{convention}', '{orientation}'"
             )
         if not 1 <= len(links) <= MOST_JOINTS:
             raise InputError(f"arm '{name}': has {len(links)} joints that move; 1 to {MOST_JOINTS} can be handled")
         unknown = set(unknown_frames)
-        if orientation == "none" and tool_offset is not None:
+        if orientation != "rotation_vector" and tool_offset is not None:
             tool = (0.0,) * 6 if isinstance(tool_offset, str) else (*tool_offset, 0.0, 0.0, 0.0)
             unknown = unknown - {"tool"} | ({"tool"} if isinstance(tool_offset, str) else set())
         n = len(links)
@@ -200,6 +207,9 @@ class SerialArm(Mechanism):
         for i, row in enumerate(links):
             geometry += [Parameter(f"{p}{i + 1}", u, v) for p, u, v in zip(names, units, row, strict=True)]
         geometry += [Parameter(f"tool_{c}", u, v) for (c, u), v in zip(FRAME, tool, strict=True)]
+        if orientation == "direction" and n == len(MOUNT):
+            named = {f"{p}{i}": sense for i, own in enumerate(MOUNT, 1) for p, sense in own.items()}
+            geometry = [replace(p, sense=named.get(p.name, "")) for p in geometry]
         pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
         super().__init__(
             name=name,
@@ -219,6 +229,13 @@ class SerialArm(Mechanism):
         self.register_buffer("signs", torch.tensor(joint_sign or [1.0] * n, dtype=torch.float64))
         self.register_buffer("revolute", torch.tensor(turn))
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
+        # Which of the parameters of each link count, `n x k`.
+        counting = torch.ones(n, len(names), dtype=torch.float64)
+        if orientation == "direction":
+            behind = {"standard": ("a", "d"), "modified": ("d",), "urdf": ()}[convention]
+            counting[:, [k for k, unit in enumerate(units) if unit == "m"]] = 0.0
+            counting[-1, [k for k, p in enumerate(names) if p in behind]] = 1.0
+        self.register_buffer("counting", counting)
         self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
         self._follow_nominal()
 
@@ -267,7 +284,7 @@ class SerialArm(Mechanism):
         )
 
     def with_orientation(self, orientation: str) -> SerialArm:
-        """The same arm, nominal parameters included, for poses of another kind: "rotation_vector" or "none"."""
+        """The same arm, nominal parameters included, for poses of another kind: "none", "direction" …"""
         twin = SerialArm(**{**self.recipe["keys"], "orientation": orientation})
         kept = len(self.nominal) - (6 if self.recipe["keys"]["tool_offset"] is not None else 0)
         twin.nominal[:kept] = self.nominal[:kept]
@@ -311,7 +328,7 @@ class SerialArm(Mechanism):
 
     def link_transforms(self, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """From each link to the one before: rotation `... x n x 3 x 3` and translation `... x n x 3` [m]."""
-        links = values[..., 6:-6].reshape(*values.shape[:-1], len(self.joints), -1)
+        links = values[..., 6:-6].reshape(*values.shape[:-1], len(self.joints), -1) * self.counting
         motion = joints * self.signs
         return self._transform(links, motion * self.revolute, motion * ~self.revolute, self.axes)
 
@@ -328,7 +345,7 @@ class SerialArm(Mechanism):
     def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Position `... x 3` [m] and rotation `... x 3 x 3` of the tool, also where the pose has no orientation."""
         values = self.resolve(parameters)
-        base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3]
+        base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3] * (self.orientation != "direction")
         tool = rotation_vector_to_matrix(values[..., -3:]), values[..., -6:-3]
         rotation, position = compose(compose(base, self.link_frames(joints, values)[-1]), tool)
         return position, rotation
@@ -338,7 +355,7 @@ class SerialArm(Mechanism):
     ) -> Tensor:
         """Closed form; see `Mechanism.forward_kinematics`."""
         position, rotation = self.forward_frame(joints, parameters)
-        if self.orientation == "none":
+        if self.orientation != "rotation_vector":
             return position
         return torch.cat([position, matrix_to_rotation_vector(rotation)], dim=-1)
 
@@ -355,7 +372,7 @@ class SerialArm(Mechanism):
         turning, signs = self.revolute[:, None], self.signs[:, None]
         base = rotation_vector_to_matrix(values[..., 3:6]).mT
         linear = (torch.where(turning, swept, axes) * signs) @ base
-        if self.orientation == "none":
+        if self.orientation != "rotation_vector":
             return linear.mT
         return torch.cat([linear, (axes * turning * signs) @ base], dim=-1).mT
 
@@ -369,7 +386,7 @@ class SerialArm(Mechanism):
         tip = place + (flange @ values[..., -6:-3, None])[..., 0]
         rotations, places = (torch.stack([f[k] for f in frames], dim=-3 + k) for k in (0, 1))
         count = len(self.joints)
-        links = values[..., 6:-6].reshape(*values.shape[:-1], count, -1)
+        links = values[..., 6:-6].reshape(*values.shape[:-1], count, -1) * self.counting
         lead = tip.shape[:-1]
         before = rotations[..., :-1, :, :].expand(*lead, count, 3, 3), places[..., :-1, :].expand(*lead, count, 3)
         after = rotations[..., 1:, :, :], places[..., 1:, :]
@@ -378,15 +395,16 @@ class SerialArm(Mechanism):
         )
         base = rotation_vector_to_matrix(values[..., 3:6])
         # `... x 3 x k` each, in the frame of the poses.
-        linear = base @ moved.flatten(-3, -2).mT
+        linear = base @ (moved * self.counting[..., None]).flatten(-3, -2).mT
         angular = base @ turned.flatten(-3, -2).mT
         base_rate, tool_rate = (rotation_vector_rate(values[..., k : k + 3]) for k in (3, values.shape[-1] - 3))
         lever = (base @ tip[..., None])[..., 0]
         whole = (base @ flange).expand(*lead, 3, 3)
         eye = torch.eye(3, dtype=tip.dtype).expand(*lead, 3, 3)
         none = torch.zeros_like(eye)
-        rows = torch.cat([eye, -skew(lever) @ base_rate, linear, whole, none], -1)
-        if self.orientation == "none":
+        shift = none if self.orientation == "direction" else eye
+        rows = torch.cat([shift, -skew(lever) @ base_rate, linear, whole, none], -1)
+        if self.orientation != "rotation_vector":
             return rows
         spins = torch.cat([none, base_rate.expand(*lead, 3, 3), angular, none, whole @ tool_rate], -1)
         return torch.cat([rows, spins], -2)
