@@ -176,7 +176,7 @@ def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) ->
             f"{config.mechanism}: frame_per and tool_per give each group of rows a frame of its own; remove them to "
             "identify one machine, or identify from the rows of one group"
         )
-    mechanism = as_measured(mechanism, records.pose_coordinates, records.path)
+    mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
     if not config.frame.base and not config.frame.tool:
         check_rows(records, mechanism)
         _check_joints(records, mechanism)

@@ -95,7 +95,7 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
     ideal = torch.from_numpy(np.asarray(found["ideal"]))
     nominal = machine.forward_kinematics(records.joints, guess=pose)
     if model.machine is not None:
-        real = as_measured(model.machine.identified, machine.pose)
+        real = as_measured(model.machine.identified, machine.pose, records.path, pose)
         predicted = real.forward_kinematics(records.joints, guess=pose)
     else:
         predicted = machine.forward_kinematics(ideal, guess=pose)
