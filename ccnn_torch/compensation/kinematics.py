@@ -268,7 +268,7 @@ class Links(nn.Module):
     def __init__(self, arm: Mechanism) -> None:
         super().__init__()
         assert isinstance(arm, SerialArm)
-        self._turned = arm.orientation != "none"
+        self._turned = arm.orientation == "rotation_vector"
         links = _links(arm)
         spins, shifts = _screws(links)
         for name, value in {

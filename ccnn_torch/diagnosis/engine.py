@@ -278,7 +278,7 @@ def why_set_aside(analysis: Analysis, rows: PlausibleRows, chosen: Tensor) -> di
 def gross_outliers(analysis: Analysis) -> Tensor:
     """Rows set aside that are so far off that no heavy tail of ordinary noise makes them, `s` bool."""
     white = analysis.whitening
-    size = (analysis.residual[:, white.channels] / white.sigma).abs().amax(-1)
+    size = (white.picked(analysis.residual) / white.sigma).abs().amax(-1)
     aside = (white.weight <= 0) & ~analysis.near_singular
     far = aside & (size > _GROSS_TOGETHER)
     together = int(far.sum()) > max(1.0, _SHARE_TOGETHER * len(far))

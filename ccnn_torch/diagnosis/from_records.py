@@ -16,17 +16,28 @@ from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, frame_drift, in_time, usable_verdict
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
+from ccnn_torch.diagnosis.mount import SET_ANEW, mount_notes
 from ccnn_torch.diagnosis.residual.distance import size_of
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, noise_of_columns
 from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
 from ccnn_torch.diagnosis.result import Diagnosis
-from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, used_covariates
+from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, used_covariates
+from ccnn_torch.effects.by_group import ByGroup
 from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.effects.found_machine import found_block
 from ccnn_torch.effects.time import ROW, FrameDrift, elapsed
 from ccnn_torch.errors import InputError, RowsError
-from ccnn_torch.mechanisms import BlackBox, Instrument, Mechanism, SerialArm, as_measured, fit_unknown, judge_frames
+from ccnn_torch.mechanisms import (
+    BlackBox,
+    Instrument,
+    Mechanism,
+    SerialArm,
+    as_measured,
+    fit_unknown,
+    judge_frames,
+    sees_directions,
+)
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import Records, load_records
@@ -73,13 +84,34 @@ def diagnose(
             "diagnose(load_records(path, mechanism), mechanism); write_simulated(path, made) puts simulated rows there"
         )
     situation = situation_of(records, mechanism, gravity)
+    mounts = _mounts(records, situation)
+    if effects is None and len(mounts) > 1:
+        effects = ["all", *(ByGroup(make_effect(name), _word(situation), mounts) for name in SET_ANEW)]
     with naming(records):
         said = diagnose_rows(
             situation, records.pose, noise_of(noise, situation), effects, seed, _instrument(records, situation)
         )
-    notes = [*records.missing, *said.notes, *_unread(records, situation, said)]
+    mounted = mount_notes(said, mounts, _word(situation))
+    notes = [*records.missing, *said.notes, *mounted, *_unread(records, situation, said)]
     said = replace(said, lines=tuple(records.lines.tolist())).with_entries(notes=notes, machine=named_machine(said))
     return with_network(said, seed) if network else said
+
+
+def _mounts(records: Records, situation: Situation) -> dict[str, Tensor]:
+    """Base frame of each group of rows that show directions, by the group's name, `6`; {} for other machines."""
+    arm, values = situation.mechanism, situation.parameters
+    if not sees_directions(arm) or values is None:
+        return {}
+    assert isinstance(arm, SerialArm)
+    columns = [records.columns[name].tolist() for name in arm.frame_per]
+    rows = [", ".join(f"{v:.10g}" for v in row) for row in zip(*columns, strict=True)] or [""]
+    values = values.expand(len(rows), -1)
+    return {name: values[rows.index(name), :6] for name in sorted(set(rows))}
+
+
+def _word(situation: Situation) -> str:
+    """What a group of rows is called."""
+    return next(iter(getattr(situation.mechanism, "frame_per", ())), "")
 
 
 def _instrument(records: Records, situation: Situation) -> Noise | None:
@@ -125,7 +157,7 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
             f"records: they have {records.joints.shape[-1]} joints and {mechanism.name} has {len(mechanism.joints)}; "
             "load them with the mechanism that was measured"
         )
-    mechanism = as_measured(mechanism, records.pose_coordinates, records.path)
+    mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
     parameters = fit_unknown(mechanism, records.joints, records.pose, columns=records.columns)
     if isinstance(mechanism, SerialArm) and parameters is not None:
         try:

@@ -20,7 +20,7 @@ from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
 from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
 from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
-from ccnn_torch.diagnosis.residual.whitening import Whitening, moving_channels, renewed
+from ccnn_torch.diagnosis.residual.whitening import Whitening, device_axes, moving_channels, renewed
 from ccnn_torch.effects import Acting, Effect, Situation, measured_channels
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.evidence.priors import EFFECT
@@ -226,12 +226,11 @@ class _Rows:
 
     def whitening(self) -> Whitening:
         """Noise from the richest fit; rows that only all effects together explain count as yet."""
-        channels = moving_channels(self.model.situation)
-        white = fitted_whitening(
-            self.target, [self.columns[..., g] for g in self.groups], channels, None, self.fine, self.seen
-        )
-        left = self.left[:, channels] / white.sigma
-        near = inlying(left.norm(dim=-1), self.fine, len(channels), 0)
+        here = self.model.situation
+        columns, channels = [self.columns[..., g] for g in self.groups], moving_channels(here)
+        white = fitted_whitening(self.target, columns, channels, None, self.fine, self.seen, device_axes(here))
+        left = white.picked(self.left) / white.sigma
+        near = inlying(left.norm(dim=-1), self.fine, len(white.channels), 0)
         return replace(white, weight=(self.fine & near).to(left.dtype))
 
     def grams(self, white: Whitening) -> Grams:
@@ -243,8 +242,8 @@ class _Rows:
         """Noise and weights from what a fit leaves."""
         values = max(white.count(torch.nonzero(self.fine).squeeze(-1)), 1.0)
         free = 1 - float(fit.effective[0]) / values
-        left = (self.target - self.columns @ at)[:, white.channels]
-        return renewed(white, left, self.target[:, white.channels], free, self.fine)
+        left = white.picked(self.target - self.columns @ at)
+        return renewed(white, left, white.picked(self.target), free, self.fine)
 
     def with_shape(self, i: int, known: Known) -> _Rows:
         """The same with another shape of one of the effects, which does nothing yet."""

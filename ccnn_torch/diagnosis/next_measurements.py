@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import scaled_signature
 from ccnn_torch.diagnosis.residual.rows import frame_columns, in_groups
+from ccnn_torch.diagnosis.residual.whitening import device_axes
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Situation
@@ -158,7 +160,7 @@ def _columns(analysis: Analysis, found: FittedSet, there: Situation) -> Tensor:
         taken = torch.linalg.pinv(white(analysis.fitted)[keep].flatten(0, 1)) @ before
         columns = columns - frames @ (in_groups(analysis.situation)[0] @ taken)
     noise = white.sigma * analysis.floor**0.5
-    whitened: Tensor = columns[:, white.channels] / noise[:, None]
+    whitened: Tensor = replace(white, axes=device_axes(there)).picked(columns) / noise[:, None]
     return whitened
 
 

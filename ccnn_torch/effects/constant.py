@@ -19,7 +19,7 @@ from ccnn_torch.effects.columns import (
 )
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import Situation, where_moved
-from ccnn_torch.mechanisms import Mechanism, Partial, Seen, SerialArm
+from ccnn_torch.mechanisms import Mechanism, Partial, Seen, SerialArm, sees_directions
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
 _SCALE = {"m": 1e-3, "rad": 1e-3}
@@ -66,6 +66,8 @@ class Tool(Effect):
         """A platform that turns, and a tool frame that is known; an unknown one is fitted before anything else."""
         if "tool" in getattr(mechanism, "unknown_frames", ()):
             return f"a known tool frame: that of {mechanism.name} is fitted to the records anyhow"
+        if sees_directions(mechanism):
+            return "positions: to directions a shift of the tool is an error of the last link"
         whole = inside(mechanism)
         if not isinstance(whole, SerialArm) and whole.frame(whole.home_pose)[1] is None:
             return "a platform that turns: on this one a shift of the tool is a shift of the frame"
@@ -113,7 +115,9 @@ class Instrument(Effect):
     description = "the measuring device itself: errors of scale and axes that are not square"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """Measured poses."""
+        """Positions."""
+        if sees_directions(mechanism):
+            return "positions: directions have no scale"
         poses = not isinstance(mechanism, Seen) or isinstance(mechanism, Partial)
         return "" if poses else f"measured poses: {mechanism.name} is seen by an instrument with parameters of its own"
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.effects.columns import by_joint, inside, own_parameters, per_force
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
-from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms import Mechanism, SerialArm, sees_directions
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 
@@ -181,6 +181,10 @@ class Gravity(Effect):
     name = "gravity"
     kind = "joints"
     description = "deflection under the machine's own weight"
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Positions."""
+        return "positions: what bends turns a direction as flexure does" if sees_directions(mechanism) else ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Sag of each joint and what goes with it, joint by joint; then the centre of mass."""

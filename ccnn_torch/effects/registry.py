@@ -20,9 +20,10 @@ from ccnn_torch.effects.joints import Coupling, JointGain, JointOffset, Transmis
 from ccnn_torch.effects.loads import Compliance, Gravity
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects.situation import Situation
+from ccnn_torch.effects.sky import Flexure
 from ccnn_torch.effects.time import Drift, FrameDrift, Latency, Thermal
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, sees_directions
 from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.plugins import class_hint, is_plugin, load_plugin, users_code
 from ccnn_torch.units import to_si
@@ -346,6 +347,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "coupling": Coupling,
     "latency": Latency,
     "frame_drift": FrameDrift,
+    "flexure": Flexure,
     "instrument": Instrument,
 }
 """Name -> maker. The order is that of listings, and of what a verdict names where several do the very same: causes in
@@ -390,8 +392,9 @@ def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
 
 
 def effect_names(mechanism: Mechanism) -> list[str]:
-    """Of the library's effects, and of the causes that the mechanism's own parameters name."""
-    return [*EFFECTS, *(e.name for e in parameter_causes(mechanism))]
+    """Of the library's effects that such a machine may have, and of the causes that its own parameters name."""
+    library = [name for name in EFFECTS if name != Flexure.name or sees_directions(mechanism)]
+    return [*library, *(e.name for e in parameter_causes(mechanism))]
 
 
 def _plain(name: str) -> str:

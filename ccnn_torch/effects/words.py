@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from ccnn_torch.effects.by_group import BY
 from ccnn_torch.effects.constant import PARAMETER
 from ccnn_torch.effects.registry import OUTLIER
 
@@ -123,6 +124,13 @@ _WORDS = {
         "",
         "The time stamps: read pose and command at the same moment, or measure at rest.",
     ),
+    "flexure": Words(
+        "flexure of the tube or refraction",
+        "flexure of the tube or refraction",
+        "Towards the zenith: TF times the sine of the zenith distance and TX times its tangent.",
+        "The mirror and its cell, the truss of the tube; of TX also the correction for refraction (pressure, "
+        "temperature, humidity, colour).",
+    ),
     "instrument": Words(
         "an error of the measuring device",
         "error of the measuring device",
@@ -231,5 +239,9 @@ def words_of(name: str) -> Words:
         own = name.removeprefix(PARAMETER)
         look = f"{own} in the simulator and as built."
         return Words(f"a wrong value of the parameter {own}", f"wrong value of {own}", "", look)
+    if BY in name:
+        own, _, group = name.partition(BY)
+        words, each = words_of(own), f", another one in each {group}"
+        return words._replace(cause=words.cause + each, short=words.short + each)
     whole = f"the effect {name}"
     return _WORDS.get(name, Words(whole, whole, "", f"What {name} describes, in {{where}}."))

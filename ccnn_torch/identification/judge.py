@@ -57,7 +57,7 @@ def figure_text(block: Mapping[str, Any] | None, key: str, scale: float = 1.0, d
 def before_and_after(
     before: PoseError, after: PoseError, noise: PoseError | None = None, removed: bool = False
 ) -> dict[str, Any]:
-    """Position and rotation: RMS and maximum over the poses of a machine, before and after.
+    """Position and rotation: RMS, mean and maximum over the poses of a machine, before and after.
 
     Args:
         before, after: `r x t`; NaN where nothing of the kind was measured.
@@ -74,6 +74,8 @@ def before_and_after(
         entries: dict[str, Tensor | None] = {
             "before": _rms(first),
             "after": _rms(last),
+            "mean_before": first.nanmean(-1),
+            "mean_after": last.nanmean(-1),
             "max_before": first.nan_to_num().amax(-1),
             "max_after": last.nan_to_num().amax(-1),
         }

@@ -199,7 +199,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
 def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[Records, Mechanism]:
     """Records that fit a mechanism, and the mechanism as it was measured there (of its pose all, or a part)."""
     records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
-    mechanism = as_measured(mechanism, records.pose_coordinates, records.path)
+    mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
     if not config.frame.base and not config.frame.tool:
         check_rows(records, mechanism)
         _check_joints(records, mechanism)

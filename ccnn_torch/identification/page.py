@@ -77,7 +77,8 @@ def identified_verdict(results: Block) -> str:
     failed = not_settled(results)
     parts = []
     for name, block in named:
-        parts.append(f"{name} {_with_unit(block, 'before')} → {_with_unit(block, 'after')} RMS")
+        mean = f" (mean {_with_unit(block, 'mean_after')})" if "constraint" in results and "mean_after" in block else ""
+        parts.append(f"{name} {_with_unit(block, 'before')} → {_with_unit(block, 'after')} RMS{mean}")
     rows = count_text(results["rows"]["test"], "held-out pose")
     machines = f" of {results['machines']} machines" if results["machines"] > 1 else ""
     if "constraint" in results:
@@ -213,6 +214,9 @@ def _interval_note(results: Block) -> str:
     return "95 % of intervals of ±1.96 standard deviations hold the true value, if the geometry is all that is wrong."
 
 
+_SHOWN = (("before", "before"), ("after", "after"), ("mean_after", "mean after"), ("max_after", "maximum after"))
+
+
 def _method_table(results: Block) -> Table:
     methods = results["methods"]
     columns = {"method": [name + (" (leg by leg)" if block["per_leg"] else "") for name, block in methods.items()]}
@@ -221,10 +225,10 @@ def _method_table(results: Block) -> Table:
         if results["test"][name] is None:
             continue
         tests = [block["test"][name] for block in methods.values()]
-        for key, words in (("before", "before"), ("after", "after"), ("max_after", "maximum after")):
+        for key, words in _SHOWN:
             scale, unit = _shared_unit(tests, key)
             columns[f"{name} {words} [{unit}]"] = [figure_text(test, key, scale) for test in tests]
-        details += [*columns][-1:]
+        details += [*columns][-2:]
     columns["machines"] = [str(block["machines"]) for block in methods.values()]
     columns["converged"] = [f"{100 * block['converged']:.0f} %" for block in methods.values()]
     columns["time [s]"] = [number_text(block["seconds"], 3) for block in methods.values()]

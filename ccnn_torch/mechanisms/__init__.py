@@ -9,7 +9,12 @@ if TYPE_CHECKING:
     from ccnn_torch.mechanisms.frames.framed import Framed as Framed
     from ccnn_torch.mechanisms.frames.instrument import Instrument as Instrument, fit_unknown as fit_unknown
     from ccnn_torch.mechanisms.frames.judge import judge_frames as judge_frames
-    from ccnn_torch.mechanisms.frames.partial import Partial as Partial, Seen as Seen, as_measured as as_measured
+    from ccnn_torch.mechanisms.frames.partial import (
+        Partial as Partial,
+        Seen as Seen,
+        as_measured as as_measured,
+        sees_directions as sees_directions,
+    )
     from ccnn_torch.mechanisms.frames.set_ups import SetUps as SetUps, set_ups as set_ups
     from ccnn_torch.mechanisms.machines.delta import Delta as Delta, DeltaLinear as DeltaLinear
     from ccnn_torch.mechanisms.machines.five_bar import FiveBar as FiveBar

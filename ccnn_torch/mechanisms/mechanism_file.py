@@ -140,7 +140,7 @@ def dh_text(arm: SerialArm) -> str:
         "frame_per": list(arm.frame_per),
         "tool_per": list(arm.tool_per),
     }
-    if arm.orientation == "none" and arm.recipe["keys"]["tool_offset"] is not None:
+    if arm.orientation != "rotation_vector" and arm.recipe["keys"]["tool_offset"] is not None:
         tree["tool_offset"] = "unknown" if arm.tool_per else values[-6:-3]
     return dump_yaml(tree, width=200)
 

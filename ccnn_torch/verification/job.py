@@ -74,7 +74,7 @@ def verify_model(
     loaded = load_records(
         records, machine, names, learns=False, columns=columns or there, joint_map=joint_map or counted
     )
-    machine = as_measured(machine, loaded.pose_coordinates, loaded.path)
+    machine = as_measured(machine, loaded.pose_coordinates, loaded.path, loaded.pose)
     if not refit_frames:
         check_rows(loaded, machine)
     rows = predict(model, machine, loaded, compensated)

@@ -110,7 +110,9 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
     nominal = machine.forward_kinematics(records.joints, guess=guess)
     if model.machine is not None:
         real = model.machine.identified
-        real = machine.around(real) if isinstance(machine, Seen) else as_measured(real, machine.pose)
+        real = (
+            machine.around(real) if isinstance(machine, Seen) else as_measured(real, machine.pose, records.path, pose)
+        )
         predicted = real.forward_kinematics(records.joints, guess=guess)
     else:
         predicted = machine.forward_kinematics(ideal, guess=guess)

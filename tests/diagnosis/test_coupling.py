@@ -9,7 +9,7 @@ import torch
 
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.effects import Situation, default_gravity
-from ccnn_torch.mechanisms import SerialArm, load_mechanism
+from ccnn_torch.mechanisms import SerialArm, fit_frames, load_mechanism
 
 SCARA = """\
 robot: scara
@@ -49,3 +49,34 @@ def test_the_screw_of_a_quill_is_named_beside_wrong_links_and_zeros(seed: int, t
     assert found.verdict["probability"] > 0.8
     coupling = next(e for e in found.effects if e["name"] == "coupling")["parameters"]
     assert coupling["q3 by q4"]["value"] == pytest.approx(1.91e-4, rel=0.05)
+
+
+PANDA = """\
+robot: seven
+dof: 7
+convention: modified Denavit-Hartenberg
+units: {length: m, angle: rad}
+a: [0, 0, 0, 0.0825, -0.0825, 0, 0.088]
+alpha: [0, -1.5707963, 1.5707963, 1.5707963, -1.5707963, 1.5707963, 1.5707963]
+d: [0.333, 0, 0.316, 0, 0.384, 0, 0.1]
+theta: [0, 0, 0, 0, 0, 0, 0]
+base_frame: unknown
+tool_frame: unknown
+"""
+
+
+def test_no_machine_has_a_belt_from_every_joint_to_every_other_one(tmp_path: Path) -> None:
+    """42 pairs at once would fit whatever a device does smoothly; a few pairs are a cause."""
+    (tmp_path / "seven.yaml").write_text(PANDA)
+    arm = load_mechanism(str(tmp_path / "seven.yaml"))
+    assert isinstance(arm, SerialArm)
+    generator = torch.Generator().manual_seed(3)
+    joints = arm.sample_joints(110, generator) / 3
+    moved = joints.clone()
+    moved[:, 5] += 3e-3 * joints[:, 4]
+    pose = arm.forward_kinematics(moved)
+    pose = pose + 1e-4 * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
+    here = Situation(arm, joints, {}, default_gravity(arm), fit_frames(arm, joints, pose))
+    found = diagnose_rows(here, pose)
+    columns = [a.columns.shape[-1] for a in found.analysis.atoms if a.name == "coupling"]
+    assert found.verdict["effects"] == ["coupling"] and max(columns) <= 16

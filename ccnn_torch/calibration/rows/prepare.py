@@ -214,7 +214,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     records = load_records(source, mechanism, config.covariates, columns=config.columns, joint_map=config.joint_map)
     doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
-    mechanism = as_measured(mechanism, records.pose_coordinates, records.path)
+    mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
     if isinstance(mechanism, SerialArm) and config.geometry != "none":
         mechanism = mechanism.with_link_frames()
     held = rows_of_test_file(config.split, records.parts)

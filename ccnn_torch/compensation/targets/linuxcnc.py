@@ -43,7 +43,7 @@ def print_linuxcnc(form: Form | None, mechanism: Mechanism, source: str) -> dict
         covariates=max(len(covariates), 1),
         pins=pins,
         axes=wrapped([f"Axes: {_axes(mechanism)}."]),
-        rows=len(mechanism.joints) if not serial else 3 if mechanism.orientation == "none" else 6,
+        rows=len(mechanism.joints) if not serial else 6 if mechanism.orientation == "rotation_vector" else 3,
         found=12 if serial else len(mechanism.joints),
         units=["CCNN_UNITS_PER_METRE" if j.unit == "m" else "CCNN_DEGREES" for j in mechanism.joints],
         home=[dialect.literal(v) for v in home.tolist()],
@@ -101,7 +101,7 @@ def _fields(mechanism: Mechanism) -> dict[str, str]:
 
 def _axes(mechanism: Mechanism) -> str:
     if isinstance(mechanism, SerialArm):
-        if mechanism.orientation == "none":
+        if mechanism.orientation != "rotation_vector":
             return (
                 "X, Y, Z alone, in the frame in which the machine was measured. Its records have no orientation: what "
                 "A, B, C command is not followed, and what they show is that of the nominal arm"

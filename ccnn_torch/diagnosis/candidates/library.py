@@ -24,6 +24,10 @@ from ccnn_torch.evidence.priors import EFFECT
 _EITHER = math.log(2.0)
 
 
+# Columns of a coupling: of eight pairs with their zeros, or of all pairs of four joints.
+_MOST_COUPLED = 16
+
+
 class Known(NamedTuple):
     """Shapes found before.
 
@@ -78,7 +82,7 @@ def candidates_about_nominal(
         for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(without_unused_rows(_atom(situation, situation, atom.effect, shaped), usable))
-    return [*whole, *parts, *starts]
+    return [*filter(_is_plausible, [*whole, *parts]), *starts]
 
 
 def candidates_about_set(
@@ -134,7 +138,7 @@ def candidates_about_set(
     for part in single_joint_atoms(situation, asked, white, left):
         if part is not None:
             parts.setdefault((part.name, part.used), part)
-    atoms = [*whole, *parts.values(), *without_secondary(situation, whole)]
+    atoms = [*filter(_is_plausible, [*whole, *parts.values(), *without_secondary(situation, whole)])]
     for effect in (e for e in effects if e.shapes(situation)):
         others = [a for a in acting if a.effect is not effect]
         start = next((a.shape for a in acting if a.effect is effect), None)
@@ -171,6 +175,11 @@ def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
     return [Shaped(torch.tensor(usual, dtype=situation.joints.dtype), None, 0.0)]
 
 
+def _is_plausible(atom: Atom) -> bool:
+    """Whether a machine may have an atom: no arm has a belt from every joint to every other one."""
+    return not (isinstance(atom.effect, Coupling) and atom.columns.shape[-1] > _MOST_COUPLED)
+
+
 def has_usual_shape(situation: Situation, atom: Atom) -> bool:
     """Whether an atom has the shapes that are usual for its effect."""
     usual = [] if atom.effect is None else _usual(situation, atom.effect)
@@ -194,11 +203,13 @@ class _Choice:
         parts: numbers of the coefficients of each joint or leg.
         own: products of all of the columns among themselves and with what is to be explained.
         squares: of what is to be explained, 0-dim.
+        most: parts that may be chosen.
     """
 
     parts: list[list[int]]
     own: GroupProducts
     squares: Tensor
+    most: int
     chosen: list[int] = field(default_factory=list)
     lots: int = 0
     reached: float = -math.inf
@@ -216,7 +227,7 @@ class _Choice:
             self.done = True
             return
         self.chosen, self.reached, self.lots = wider, float(evidence[best]), self.lots + 1
-        self.done = self.lots >= max(len(self.parts) // 2, 1)
+        self.done = self.lots >= self.most
 
     @property
     def charge(self) -> float:
@@ -241,7 +252,10 @@ def single_joint_atoms(
         parts = _parts(situation, atom)
         if len(parts) > 1:
             target = white(residual)
-            choices[k] = _Choice(parts, own_products(white(atom.columns), target), target.square().sum())
+            most = max(len(parts) // 2, 1)
+            if isinstance(atom.effect, Coupling):
+                most = min(most, _MOST_COUPLED // 2)
+            choices[k] = _Choice(parts, own_products(white(atom.columns), target), target.square().sum(), most)
     while going := [c for c in choices.values() if not c.done]:
         cut = [[GroupProducts(c.own.xx[p][:, p], c.own.xy[p]) for p in c.wider()] for c in going]
         counts = [len(group) for group in cut]

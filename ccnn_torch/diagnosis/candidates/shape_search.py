@@ -160,7 +160,9 @@ class Scan:
         mine = _of_run(basis, columns)
         if self.lead is not None:
             return (_of(self.lead, rows, 0) @ (mine * self.size[columns])).nan_to_num_()
-        mine = mine[:, :, self.white.channels] * self.size[columns]
+        axes, channels = self.white.axes, self.white.channels
+        mine = mine[:, :, channels] if axes is None else _of(axes, rows, 0) @ mine
+        mine = mine * self.size[columns]
         return mine.mul_(_of(self.white.scale, rows, 0)[..., None]).nan_to_num_()
 
     def best(self, ground: SearchRows, start: Tensor | None = None) -> Shaped:

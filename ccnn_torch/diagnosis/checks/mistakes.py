@@ -242,7 +242,7 @@ def tool_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
         return ""
     keys = arm.recipe["keys"]
     unknown = {"unknown_frames": (*arm.unknown_frames, "tool")}
-    free = {"tool_offset": "unknown"} if arm.orientation == "none" else unknown
+    free = unknown if arm.orientation == "rotation_vector" else {"tool_offset": "unknown"}
     values = fit_frames(SerialArm(**{**keys, **free}), joints, measured)
     error = arm.pose_error(arm.forward_kinematics(joints, values), measured)
     before = arm.pose_error(arm.forward_kinematics(joints, situation.parameters), measured)

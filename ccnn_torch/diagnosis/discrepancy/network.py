@@ -155,7 +155,7 @@ def _predicted(
     """
     white, situation, count = analysis.whitening, analysis.situation, len(left)
     here = white.keep()[rows]
-    slope = situation.jacobian[here][:, white.channels] / white.sigma[:, None]
+    slope = white.picked(situation.jacobian)[here] / white.sigma[:, None]
     deviation = (torch.linalg.pinv(slope) @ left[..., None])[..., 0]
     joints = situation.joints[here]
     conditions = [v[here] for v in situation.covariates.values() if float(v[here].max() - v[here].min()) > 0]

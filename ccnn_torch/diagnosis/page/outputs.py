@@ -137,7 +137,7 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
         "joints": situation.joints,
         "residual": drawn,
         "remainder": left,
-        "noise": _spread(analysis, (analysis.whitening.sigma * analysis.floor**0.5)[None])[0],
+        "noise": _noise(analysis),
         "held_out": held,
         "set_aside": 1 - held,
     }
@@ -187,11 +187,12 @@ def _machine(situation: Situation, place: Tensor, keep: Tensor) -> dict[str, Ten
     return {f"machine.{name}": line for name, line in lines.items()}
 
 
-def _spread(analysis: Analysis, values: Tensor) -> Tensor:
-    """Values of the channels that count, `s x c`, among all channels, `s x c0`; the others are 0."""
-    out = values.new_zeros(len(values), analysis.residual.shape[-1])
-    out[:, analysis.whitening.channels] = values
-    return out
+def _noise(analysis: Analysis) -> Tensor:
+    """Standard deviation of each of all channels, `c0` [m, rad]: the root mean square over the rows."""
+    white = analysis.whitening
+    sizes = torch.diag(white.sigma * analysis.floor**0.5)
+    squares = [white.unpicked(one.expand(len(white.weight), -1)).square().mean(0) for one in sizes]
+    return sum(squares, torch.zeros_like(squares[0])).sqrt()
 
 
 def _remainder(
@@ -202,7 +203,7 @@ def _remainder(
     chosen = [i for i in members if with_discrepancies or not atoms[i].is_discrepancy]
     out = residual.clone()
     keep = analysis.whitening.keep()
-    out[keep] = _spread(analysis, held_out(analysis, [chosen], seed)[0].left)
+    out[keep] = analysis.whitening.unpicked(held_out(analysis, [chosen], seed)[0].left, keep)
     return out
 
 
@@ -226,11 +227,10 @@ def _in_joints(analysis: Analysis, part: Tensor, left: Tensor, columns: list[Col
 
     A deviation of the joints looks the same everywhere in the workspace, what it does to the pose does not.
     """
-    channels, sigma = analysis.whitening.channels, analysis.whitening.sigma
+    white = analysis.whitening
     jacobian = analysis.situation.jacobian
     keep = torch.nonzero(~analysis.near_singular & jacobian.isfinite().flatten(1).all(-1)).flatten()
-    slope = jacobian[keep][:, channels] / sigma[:, None]
-    both = torch.stack([part, left], -1)[keep][:, channels] / sigma[:, None]
+    slope, both = (white.picked(v)[keep] / white.sigma[:, None] for v in (jacobian, torch.stack([part, left], -1)))
     # More joints than channels leave a choice, of which the smallest is taken.
     found = torch.linalg.pinv(slope, rtol=1e-9) @ both
     found = part.new_zeros(len(part), slope.shape[-1], 2).index_copy(0, keep, found)

@@ -8,7 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.residual.whitening import MAD, NO_NOISE, Whitening, renewed
+from ccnn_torch.diagnosis.residual.whitening import (
+    MAD,
+    NO_NOISE,
+    Whitening,
+    renewed,
+)
 from ccnn_torch.evidence.marginal_likelihood import (
     NO_COLUMNS,
     Axes,
@@ -42,6 +47,7 @@ def fitted_whitening(
     noise: Tensor | None,
     usable: Tensor,
     seen: Tensor | None = None,
+    axes: Tensor | None = None,
 ) -> Whitening:
     """Noise and row weights from the largest model: of everything that may be there, one by one what explains most of
     what is left, as long as the evidence for it is more than slight.
@@ -53,21 +59,23 @@ def fitted_whitening(
         noise: known standard deviation of each of the c0 channels, or None.
         usable: `s`, False where a row is left out from the start.
         seen: which values were measured, `s x c0` bool; None = all.
+        axes: of the device, as in `Whitening`.
     """
-    known, weight = 0.0 if noise is None else _KNOWN, usable.to(residual.dtype)
+    if axes is not None and seen is not None:
+        # A direction that lacks a part is none.
+        usable, seen = usable & seen.all(-1), None
     seen = None if seen is None else seen[:, channels]
-    white = Whitening(channels, residual.new_ones(len(channels)), weight, known, seen)
-    rms = white.usual(residual[:, channels], usable) * MAD
-    rms = rms.clamp_min(NO_NOISE)
-    sigma = rms if noise is None else noise[channels]
-    white = replace(white, sigma=sigma)
-    shown = [c if len(channels) == c.shape[1] else c[:, channels] for c in columns if c.shape[-1]]
-    shown = [c.to(residual.dtype) if seen is None else c.to(residual.dtype) * seen[..., None] for c in shown]
-    every = _Everything(shown, white)
-    y = residual[:, channels]
+    given, known = (residual.new_ones(residual.shape[-1]), 0.0) if noise is None else (noise, _KNOWN)
+    white = Whitening(channels, given[channels], usable.to(residual.dtype), known, seen, axes)
+    y = white.picked(residual)
+    shown = [white.picked(c).to(residual.dtype) for c in columns if c.shape[-1]]
+    shown = shown if seen is None else [c * seen[..., None] for c in shown]
     count = float(y.numel()) if seen is None else float(seen.sum())
     if noise is None:
-        white = replace(white, sigma=sigma * _noise_share(every, y, white).sqrt())
+        white = replace(white, sigma=(white.usual(y, usable) * MAD).clamp_min(NO_NOISE))
+    every = _Everything(shown, white)
+    if noise is None:
+        white = replace(white, sigma=white.sigma * _noise_share(every, y, white).sqrt())
     chosen: list[int] = []
     log_scale = y.new_zeros(1, 0)
     left, free = y, 1.0

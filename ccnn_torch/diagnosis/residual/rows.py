@@ -7,7 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis.residual.whitening import moving_channels
 from ccnn_torch.effects import Situation
+from ccnn_torch.mechanisms import sees_directions
 
 # Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
 _CONDITION = 50.0
@@ -45,8 +47,11 @@ def copies_of(situation: Situation, measured: Tensor) -> Tensor:
     return first[number] < torch.arange(len(number))
 
 
-def near_singular(situation: Situation, channels: Tensor) -> Tensor:
-    """Rows whose Jacobian is far worse conditioned than the others', `s`."""
+def near_singular(situation: Situation) -> Tensor:
+    """Rows whose Jacobian is far worse conditioned than the others', `s`; a direction at the pole is as good as any."""
+    channels = moving_channels(situation)
+    if sees_directions(situation.mechanism):
+        return torch.zeros(len(situation.joints), dtype=torch.bool)
     jacobian = torch.nan_to_num(situation.jacobian[:, channels]).clone()
     jacobian[:, channels >= 3] *= _LEVER
     values = torch.linalg.svdvals(jacobian)

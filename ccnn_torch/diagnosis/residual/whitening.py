@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects import Situation
+from ccnn_torch.mechanisms import sees_directions
 
 # Degrees of freedom of the row weights (Student t), and beyond how many times its noise a row is set aside.
 _DEGREES = 4.0
@@ -38,6 +39,7 @@ class Whitening:
         weight: of each row, `s`; 0 = set aside.
         known: weight of the prior knowledge of the noise, in values; 0 = estimated from these rows.
         seen: which values were measured, `s x c` bool; None = all.
+        axes: of the measuring device, in which the channels are, `s x c x c0`; None = those of the base frame.
     """
 
     channels: Tensor
@@ -45,10 +47,26 @@ class Whitening:
     weight: Tensor
     known: float
     seen: Tensor | None = None
+    axes: Tensor | None = None
 
     def __call__(self, values: Tensor) -> Tensor:
         """`s x c0` or `s x c0 x m` raw to `s x c` or `s x c x m`, in units of the noise, rows weighted."""
-        return self.scaled(values[:, self.channels] if len(self.channels) < values.shape[1] else values)
+        return self.scaled(self.picked(values))
+
+    def picked(self, values: Tensor) -> Tensor:
+        """The channels of `s x c0` or `s x c0 x m`, `s x c` or `s x c x m`."""
+        if self.axes is None:
+            return values[:, self.channels] if len(self.channels) < values.shape[1] else values
+        return (self.axes @ values[..., None])[..., 0] if values.dim() == 2 else self.axes @ values
+
+    def unpicked(self, values: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Inverse of `picked`, 0 in what is no channel: of `t x c` in some rows the `t x 3` or `t x 6`."""
+        if self.axes is not None:
+            axes = self.axes if rows is None else self.axes[rows]
+            return (axes.mT @ values[..., None])[..., 0]
+        out = values.new_zeros(len(values), 3 if int(self.channels.max()) < 3 else 6)
+        out[:, self.channels] = values
+        return out
 
     def scaled(self, values: Tensor) -> Tensor:
         """As calling it, of the channels alone: `s x c` or `s x c x m`."""
@@ -83,12 +101,26 @@ class Whitening:
         return torch.nonzero(self.weight > 0).squeeze(-1)
 
 
+def device_axes(situation: Situation) -> Tensor | None:
+    """Axes in which a device's noise is the same in all rows, `s x c x c0`; None where these are the base frame's.
+
+    Directions are seen across the motion of the last joint and along it: there is no error along the direction.
+    """
+    if not sees_directions(situation.mechanism):
+        return None
+    along = torch.nn.functional.normalize(situation.jacobian[..., -1], dim=-1)
+    across = torch.linalg.cross(torch.nn.functional.normalize(situation.platform[0], dim=-1), along, dim=-1)
+    return torch.stack([across, along], -2)
+
+
 def moving_channels(situation: Situation) -> Tensor:
     """As many channels as pose coordinates were measured, those that show most of them, `c`.
 
     A machine that is measured in two angles turns a little about a third axis, too; what is seen there is no more
     measurement, and has no noise of its own.
     """
+    if sees_directions(situation.mechanism):
+        return torch.arange(2)
     slope = torch.nan_to_num(situation.frame_slope).square().mean((0, 2))
     units = [c.unit for c in situation.mechanism.pose]
     kinds = [(slope[:3], units.count("m"), 0), (slope[3:], units.count("rad"), 3)]

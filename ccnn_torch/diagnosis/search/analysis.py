@@ -29,6 +29,7 @@ from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.rows import frame_columns, near_singular, only_usable
 from ccnn_torch.diagnosis.residual.whitening import (
     Whitening,
+    device_axes,
     moving_channels,
     renewed,
     size_of_fitted,
@@ -210,8 +211,8 @@ def analyse(
 
 def _about_nominal(situation: Situation, measured: Tensor, effects: Sequence[Effect], noise: Tensor | None) -> Analysis:
     """About the nominal machine, on a part of the rows: only where to start from."""
-    channels, residual = moving_channels(situation), pose_residual(situation, measured)
-    near = near_singular(situation, channels)
+    residual = pose_residual(situation, measured)
+    near = near_singular(situation)
     usable = torch.isfinite(residual).all(-1) & torch.isfinite(situation.jacobian).flatten(1).all(-1) & ~near
     residual, fitted = only_usable(residual, usable), frame_columns(situation, usable)
     atoms = [without_unused_rows(default_atom(situation, situation, e), usable) for e in effects]
@@ -220,11 +221,13 @@ def _about_nominal(situation: Situation, measured: Tensor, effects: Sequence[Eff
     known = [a for a in rest if bool((torch.isfinite(a.columns.sum((1, 2))) | ~usable).all())]
     rest = [without_unused_rows(a, usable) for a in known if bool(a.columns[usable].any())]
     # What does not show at all in these rows is no candidate (latency at rest).
+    channels = moving_channels(situation)
     largest = residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)
     atoms = [a for a in atoms if float((a.columns[:, channels] / largest[:, None]).abs().max()) > _SHOWN]
     everything = [a.columns for a in (*atoms, *rest) if not (a.is_discrepancy and a.name.startswith("joint"))]
     seen = measured_channels(situation, measured)
-    white = fitted_whitening(residual, [fitted, *everything], channels, noise, usable, seen)
+    about = channels, noise, usable, seen, device_axes(situation)
+    white = fitted_whitening(residual, [fitted, *everything], *about)
 
     of_effects = candidates_about_nominal(situation, atoms, white, residual, usable, fitted)
     local = local_discrepancies(situation, only_usable(situation.jacobian, usable), residual, white, fitted)
@@ -359,4 +362,4 @@ def _renewed(state: Analysis, usable: Tensor) -> Whitening:
         left = left - state.atoms[i].columns @ mean
     free = 1 - best.effective / max(state.dictionary.grams.values, 1.0)
     left = without_frames(white, left, state.fitted)
-    return renewed(white, left[:, white.channels], state.residual[:, white.channels], free, usable)
+    return renewed(white, white.picked(left), white.picked(state.residual), free, usable)

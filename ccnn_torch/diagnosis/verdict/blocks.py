@@ -26,7 +26,7 @@ class Blocks:
         """residual: nominal, `s x c0` [m, rad]; seed: of folds and draws."""
         white = analysis.whitening
         self.analysis, self.judgement, self.residual = analysis, judgement, residual
-        self.before = residual[white.keep()][:, white.channels]
+        self.before = white.picked(residual)[white.keep()]
         self.floor = noise_floor(analysis)
         self.position = white.channels < 3
         atoms = analysis.atoms
@@ -123,9 +123,12 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
         | ({"nominal": nominal[c.name]} if atom.effect.kind == "parameters" and c.name in nominal else {})
         for c, v, d in zip(coefficients, own.mean[place], deviation, strict=True)
     }
+    senses = {p.name: p.sense for p in mechanism.geometry if p.sense}
+    senses |= {f"q{name.removeprefix('theta')}": sense for name, sense in senses.items() if name.startswith("theta")}
+    for label, block in found.items():
+        if sense := senses.get(label.rpartition(": ")[2], ""):
+            block["sense"] = sense
     for parameter in mechanism.geometry:
-        if parameter.sense and parameter.name in found:
-            found[parameter.name]["sense"] = parameter.sense
         same = parameter.name if atom.effect.kind == "parameters" else parameter.same_as.removeprefix(f"{name} ")
         if parameter.word and same in found:
             found[same] |= {"word": parameter.word, "shown": parameter.shown}

@@ -63,7 +63,7 @@ def localise(analysis: Analysis, residual: Tensor, seed: int = 0) -> tuple[dict[
     """
     white, situation = analysis.whitening, analysis.situation
     keep = white.keep()
-    y = (residual[:, white.channels] / white.sigma)[keep]
+    y = (white.picked(residual) / white.sigma)[keep]
     rows = _Parts(y.square().sum(-1, keepdim=True), torch.full_like(y[:, :1], y.shape[-1]))
     drawn = _Drawn(analysis, seed)
     outputs = drawn.shares(_Parts(y.square(), torch.ones_like(y)))
@@ -106,7 +106,7 @@ def _normalised(energy: Tensor) -> Tensor:
 def _joints(analysis: Analysis, y: Tensor, keep: Tensor) -> _Parts:
     """Squares of the joint deviations that make the residual, each by what it alone moves, `s x n`."""
     white = analysis.whitening
-    jacobian = (analysis.situation.jacobian[:, white.channels] / white.sigma[:, None])[keep]
+    jacobian = (white.picked(analysis.situation.jacobian) / white.sigma[:, None])[keep]
     inverse = torch.linalg.pinv(jacobian)
     reach = jacobian.square().sum(-2)
     return _Parts((inverse @ y[..., None])[..., 0].square() * reach, inverse.square().sum(-1) * reach)

@@ -215,6 +215,13 @@ def fit_frames(
         _check_rows(arm, weights, group_of, names, needed)
     rotation, position = arm.flange(joints)
     measured = arm.frame(pose)
+    if arm.orientation == "direction":
+        tip = position + (rotation @ arm.nominal[-6:-3, None])[..., 0]
+        bases = _turned(tip, measured[0], weights, base_of, len(base_names))
+        rows = slice(None) if grouped else slice(0, 1)
+        values = arm.nominal.expand(*lead, len(base_of[rows]), -1).clone()
+        values[..., 3:6] = bases[..., base_of[rows], :]
+        return values if grouped else values[..., 0, :]
     base = arm.nominal[:6].expand(*lead, len(base_names), 6).clone()
     tool = arm.nominal[-6:].expand(*lead, len(tool_names), 6).clone()
     free_tool = 0 if "tool" not in arm.unknown_frames else 6 if arm.orientation == "rotation_vector" else 3
@@ -250,6 +257,24 @@ def fit_frames(
     values = arm.nominal.expand(*lead, len(base_of[rows]), -1).clone()
     values[..., :6], values[..., -6:] = base[..., base_of[rows], :], tool[..., tool_of[rows], :]
     return values if grouped else values[..., 0, :]
+
+
+def _turned(here: Tensor, there: Tensor, weights: Tensor, group_of: Tensor, groups: int) -> Tensor:
+    """Rotation vectors that take directions to measured ones, group by group, `... x b x 3`, without outliers.
+
+    Args:
+        here, there: `s x 3` [1].
+        weights: `... x s` [1].
+        group_of: number of each row's group, `s`.
+        groups: how many there are, `b`.
+    """
+    fine = weights
+    for _ in range(_HARD):
+        shares = fine[..., None, :] * (group_of == torch.arange(groups)[:, None]).to(here.dtype)
+        turn = nearest_rotation((shares[..., None] * there).mT @ here)
+        left = (turn[..., group_of, :, :] @ here[..., None])[..., 0] - there
+        fine = weights * inlying(torch.linalg.vector_norm(left, dim=-1), weights > 0, 2, 3 * groups)
+    return matrix_to_rotation_vector(turn)
 
 
 def _descend(problem: _Problem) -> tuple[Tensor, Tensor]:
@@ -298,7 +323,7 @@ def groups_of(
             raise InputError(f"{arm.name}: {key} names the column '{name}', which the records lack; they have {there}")
     table = np.stack([np.asarray(known[name], dtype=np.float64) for name in names], axis=-1)
     values, number = np.unique(table, axis=0, return_inverse=True)
-    said = [", ".join(f"{n} {v:g}" for n, v in zip(names, row, strict=True)) for row in values]
+    said = [", ".join(f"{n} {v:.10g}" for n, v in zip(names, row, strict=True)) for row in values]
     return torch.from_numpy(number.reshape(-1).astype(np.int64)), said
 
 

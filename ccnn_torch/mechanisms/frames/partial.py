@@ -207,16 +207,28 @@ def completed(mechanism: Mechanism, joints: Tensor, pose: Tensor, parameters: Te
     return torch.where(pose.isnan(), mechanism.forward_kinematics(joints, parameters, given), pose)
 
 
-def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "records") -> Mechanism:
-    """The mechanism as records with these pose coordinates show it: itself, an arm by positions alone, or `Partial`.
+# Share of the usual length by which the lengths of unit vectors differ.
+_UNIT = 1e-6
+
+
+def as_measured(
+    mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "records", measured: Tensor | None = None
+) -> Mechanism:
+    """The mechanism as records with these pose coordinates show it: itself, an arm by positions alone or by directions,
+    or `Partial`.
 
     Args:
         where: the file, which opens the sentence.
+        measured: their poses, `s x p` [SI]: positions that are all as far from the origin are directions.
 
     Raises:
         InputError: frames would have to be fitted to rows that show too little of them.
     """
     names, whole = [c.name for c in pose], [c.name for c in mechanism.pose]
+    if isinstance(mechanism, SerialArm) and names == ["x", "y", "z"] and _are_directions(measured):
+        looking = mechanism.with_orientation("direction")
+        if bool(looking.revolute.all()) and "tool" not in looking.unknown_frames:
+            return looking
     if names == whole or not set(names) < set(whole):
         return mechanism
     if isinstance(mechanism, SerialArm) and names == ["x", "y", "z"]:
@@ -229,3 +241,16 @@ def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "
             "as well, or a machine whose frames are known"
         )
     return Partial(mechanism, names)
+
+
+def sees_directions(mechanism: Mechanism) -> bool:
+    """Whether the pose is the unit vector in which the tool looks."""
+    return isinstance(mechanism, SerialArm) and mechanism.orientation == "direction"
+
+
+def _are_directions(measured: Tensor | None) -> bool:
+    """Whether positions `s x 3` are unit vectors."""
+    if measured is None:
+        return False
+    length = torch.linalg.vector_norm(measured[torch.isfinite(measured).all(-1)], dim=-1)
+    return len(length) > 1 and bool(((length - 1).abs() < _UNIT).all())

@@ -136,6 +136,10 @@ _DRIVE = 1e-3
 MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
 
+MOUNT = ({"alpha": "NPAE", "theta": "IA"}, {"d": "CA", "theta": "IE"})
+"""What astronomers call the parameters of the two links of a mount: axes that are not square, zero of the first joint,
+collimation (over the length of the tube), zero of the second joint."""
+
 FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
 
@@ -152,7 +156,8 @@ class SerialArm(Mechanism):
         unknown_frames: those of "base" and "tool" that must be fitted to records first (`frames.fit_frames`).
         frame_per, tool_per: record columns that number the groups with a base or tool frame of their own.
         parallel_axes: groups of joints (counted from 1) with parallel axes.
-        orientation: "rotation_vector", or "none": the pose is x, y, z alone.
+        orientation: "rotation_vector"; "none": the pose is x, y, z alone; or "direction": these are the unit vector in
+            which the tool looks, so that only lengths behind the last axis count, and a shift of the base does nothing.
         rotation_weight: [m/rad].
         drives: pairs of joints i, j (from 1): the drive of joint j moves joint i as well, by parameter driveij for each
             unit; of i = j joint i is off by that share (lead, gear ratio).
@@ -165,6 +170,7 @@ class SerialArm(Mechanism):
     limits: Tensor
     _start: Tensor
     _shares: Tensor
+    counting: Tensor
 
     def __init__(
         self,
@@ -207,15 +213,15 @@ class SerialArm(Mechanism):
             InputError: unknown convention or orientation.
         """
         keys = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        if convention not in LINKS or orientation not in ("rotation_vector", "none"):
+        if convention not in LINKS or orientation not in ("rotation_vector", "none", "direction"):
             raise InputError(
-                f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector' or 'none'; "
-                f"got '{convention}', '{orientation}'"
+                f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector', 'none' or "
+                f"'direction'; got '{convention}', '{orientation}'"
             )
         if not 1 <= len(links) <= MOST_JOINTS:
             raise InputError(f"arm '{name}': has {len(links)} joints that move; 1 to {MOST_JOINTS} can be handled")
         unknown = set(unknown_frames)
-        if orientation == "none" and tool_offset is not None:
+        if orientation != "rotation_vector" and tool_offset is not None:
             tool = (0.0,) * 6 if isinstance(tool_offset, str) else (*tool_offset, 0.0, 0.0, 0.0)
             unknown = unknown - {"tool"} | ({"tool"} if isinstance(tool_offset, str) else set())
         n = len(links)
@@ -231,6 +237,9 @@ class SerialArm(Mechanism):
         for i, j in drives:
             to, by = joint_units[i - 1], joint_units[j - 1]
             own.append(Parameter(f"drive{i}{j}", "1" if to == by else f"{to}/{by}", 0.0, scale=_DRIVE))
+        if orientation == "direction" and n == len(MOUNT):
+            named = {f"{p}{i}": sense for i, senses in enumerate(MOUNT, 1) for p, sense in senses.items()}
+            own = [replace(p, sense=named.get(p.name, "")) for p in own]
         count = len(own)
         start, shares = _start_and_shares(own, numbers)
         if numbers:
@@ -262,6 +271,13 @@ class SerialArm(Mechanism):
         self.drives, self._named, self._links_size = tuple(map(tuple, drives)), bool(numbers), count - len(drives)
         self.register_buffer("_start", start, persistent=False)
         self.register_buffer("_shares", shares, persistent=False)
+        # Which of the parameters of each link count, `n x k`.
+        counting = torch.ones(n, len(names), dtype=torch.float64)
+        if orientation == "direction":
+            behind = {"standard": ("a", "d"), "modified": ("d",), "urdf": ()}[convention]
+            counting[:, [k for k, unit in enumerate(units) if unit == "m"]] = 0.0
+            counting[-1, [k for k, p in enumerate(names) if p in behind]] = 1.0
+        self.register_buffer("counting", counting)
         self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
         self._follow_nominal()
 
@@ -310,7 +326,7 @@ class SerialArm(Mechanism):
         )
 
     def with_orientation(self, orientation: str) -> SerialArm:
-        """The same arm, nominal parameters included, for poses of another kind: "rotation_vector" or "none"."""
+        """The same arm, nominal parameters included, for poses of another kind: "none", "direction" …"""
         twin = SerialArm(**{**self.recipe["keys"], "orientation": orientation})
         kept = len(self.nominal) - (6 if self.recipe["keys"]["tool_offset"] is not None else 0)
         twin.nominal[:kept] = self.nominal[:kept]
@@ -365,7 +381,7 @@ class SerialArm(Mechanism):
     def links(self, values: Tensor) -> Tensor:
         """Parameters of the links, `... x n x 4` (DH) or `... x n x 6`, of all parameters `... x k` [SI]."""
         own = self._of_links(values)[..., : self._links_size]
-        return own.reshape(*values.shape[:-1], len(self.joints), -1)
+        return own.reshape(*values.shape[:-1], len(self.joints), -1) * self.counting
 
     def _of_links(self, values: Tensor) -> Tensor:
         """Parameters of the links, then of the drives."""
@@ -410,7 +426,7 @@ class SerialArm(Mechanism):
     def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Position `... x 3` [m] and rotation `... x 3 x 3` of the tool, also where the pose has no orientation."""
         values = self.resolve(parameters)
-        base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3]
+        base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3] * (self.orientation != "direction")
         tool = rotation_vector_to_matrix(values[..., -3:]), values[..., -6:-3]
         rotation, position = compose(compose(base, self.link_frames(joints, values)[-1]), tool)
         return position, rotation
@@ -420,7 +436,7 @@ class SerialArm(Mechanism):
     ) -> Tensor:
         """Closed form; see `Mechanism.forward_kinematics`."""
         position, rotation = self.forward_frame(joints, parameters)
-        if self.orientation == "none":
+        if self.orientation != "rotation_vector":
             return position
         return torch.cat([position, matrix_to_rotation_vector(rotation)], dim=-1)
 
@@ -430,7 +446,7 @@ class SerialArm(Mechanism):
         linear, angular = self._rates(self.link_frames(joints, values), values)
         base = rotation_vector_to_matrix(values[..., 3:6]).mT
         rates = linear @ base
-        if self.orientation != "none":
+        if self.orientation == "rotation_vector":
             rates = torch.cat([rates, angular @ base], dim=-1)
         coupled = self.coupled(values)
         return rates.mT if coupled is None else rates.mT @ coupled
@@ -474,15 +490,16 @@ class SerialArm(Mechanism):
         # `... x 3 x k` each, in the frame of the poses.
         linear, angular = (
             base @ self._by_own(part.flatten(-3, -2), rate, joints).mT
-            for part, rate in zip((moved, turned), self._rates(frames, values), strict=True)
+            for part, rate in zip((moved * self.counting[..., None], turned), self._rates(frames, values), strict=True)
         )
         base_rate, tool_rate = (rotation_vector_rate(values[..., k : k + 3]) for k in (3, values.shape[-1] - 3))
         lever = (base @ tip[..., None])[..., 0]
         whole = (base @ flange).expand(*lead, 3, 3)
         eye = torch.eye(3, dtype=tip.dtype).expand(*lead, 3, 3)
         none = torch.zeros_like(eye)
-        rows = torch.cat([eye, -skew(lever) @ base_rate, linear, whole, none], -1)
-        if self.orientation == "none":
+        shift = none if self.orientation == "direction" else eye
+        rows = torch.cat([shift, -skew(lever) @ base_rate, linear, whole, none], -1)
+        if self.orientation != "rotation_vector":
             return rows
         spins = torch.cat([none, base_rate.expand(*lead, 3, 3), angular, none, whole @ tool_rate], -1)
         return torch.cat([rows, spins], -2)

@@ -40,6 +40,8 @@ class PoseGap(Result):
     unit: Length
     before: Number
     after: Number
+    mean_before: Number = None
+    mean_after: Number = None
     max_before: Number
     max_after: Number
     noise: Number = None
@@ -176,8 +178,8 @@ class IdentifiedResults(Result):
     parameters: dict[str, Parameter]
     combinations_not_identifiable: list[str]
     test: Poses
-    """held-out measured poses against those predicted by nominal (before) and identified (after) geometry; RMS and
-    maximum"""
+    """held-out measured poses against those predicted by nominal (before) and identified (after) geometry; RMS,
+    mean and maximum"""
     methods: dict[str, Solved]
     compensation: Compensation | None
     singular_values: list[list[float]]
