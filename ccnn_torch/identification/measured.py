@@ -234,12 +234,11 @@ def _start(mechanism: Mechanism, rows: Rows, columns: Mapping[str, NDArray[np.fl
 
     columns: of the rows, which number the groups.
     """
-    about = mechanism, rows.joints[0], rows.observed[0]
-    fitted = None
+    joints, pose, fitted = rows.joints[0], rows.observed[0], None
     if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
-        fitted = fit_frames(*about, columns=columns)
+        fitted = fit_frames(mechanism, joints, pose, columns=columns)
     elif not isinstance(mechanism, Framed):
-        fitted = fit_unknown(*about)
+        fitted = fit_unknown(mechanism, joints, pose)
     return (mechanism.nominal if fitted is None else fitted)[None].clone()
 
 
