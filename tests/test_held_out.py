@@ -25,7 +25,7 @@ from ccnn_torch.report.json_files import plain
 Cli = Callable[..., tuple[int, str, str]]
 NAMES = {"J1": "q1[m]", "J2": "q2[m]", "J3": "q3[m]", "Y": "y[m]", "Z": "z[m]", "Winkel": "phi[rad]"}
 HEADERS = ["q1[m]", "q2[m]", "q3[m]", "y[m]", "z[m]", "phi[rad]"]
-QUICK = {"methods": ["constant"], "mechanism": "tripod", "geometry": "none"}
+QUICK = {"methods": ["constant"], "mechanism": "tripod", "geometry": "none", "effects": "none"}
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +41,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_table(path / "whole.csv", columns | {"set[1]": np.repeat([0.0, 1.0, 2.0], [60, 60, 40])})
     columns_text = "\n".join(f'  {key}: "{value}"' for key, value in NAMES.items())
     (path / "run.yaml").write_text(
-        "records: [day1.csv, day2.csv]\nmechanism: tripod\nmethods: [constant]\ngeometry: none\nrepeats: 2\n"
-        f"split: {{test: later.csv}}\nsave_models: false\nsave_report: false\ncolumns:\n{columns_text}\n"
+        "records: [day1.csv, day2.csv]\nmechanism: tripod\nmethods: [constant]\ngeometry: none\neffects: none\n"
+        f"repeats: 2\nsplit: {{test: later.csv}}\nsave_models: false\nsave_report: false\ncolumns:\n{columns_text}\n"
     )
     return path
 

@@ -127,7 +127,7 @@ def test_from_new_to_commands_in_the_count_of_the_controller(
     assert cli("check", config, "--quiet")[0] == 0
     assert cli("identify", config, "--out", tmp_path / "i", "--quiet", "save_report=false")[0] == 0
     run = ("run", config, "--out", tmp_path / "r", "--quiet", "save_report=false", "methods=[constant]")
-    assert cli(*run, "geometry=none")[0] == 0
+    assert cli(*run, "geometry=none", "effects=none")[0] == 0
     assert cli("plan", config, "--poses", 20, "--out", tmp_path / "p.csv", "--quiet", "candidates=200")[0] == 0
     plan = read_table(tmp_path / "p.csv")
     planned, commands = (np.stack([plan.column(f"{w}q{k}") for k in range(1, 7)], -1) for w in ("", "command_"))
@@ -176,9 +176,8 @@ def test_poses_give_commands_in_the_count_of_the_controller(
     np.testing.assert_allclose(command, shown, atol=1e-4)
 
 
-@pytest.mark.parametrize("command", ["identify", "check", "run"])
 def test_frames_that_fit_with_another_count_are_refused_with_the_map(
-    fanuc: tuple[Path, SerialArm, Array], tmp_path: Path, cli: Cli, command: str
+    fanuc: tuple[Path, SerialArm, Array], tmp_path: Path, cli: Cli
 ) -> None:
     rows, _, _ = fanuc
     config = tmp_path / "robot.yaml"
@@ -187,9 +186,9 @@ def test_frames_that_fit_with_another_count_are_refused_with_the_map(
     )
     lines = [line for line in config.read_text().splitlines() if not line.startswith("joint_map")]
     config.write_text("\n".join(lines) + "\n")
-    few = ["methods=[constant]"] if command == "run" else []
-    code, _, said = cli(command, config, "--out", tmp_path / "o", *few)
-    assert code == 2 and 'write joint_map: {q3: "q3 - q2"}' in said
+    for words in (("identify", "--out", tmp_path / "o"), ("check",), ("run", "methods=[constant]", "effects=none")):
+        code, _, said = cli(words[0], config, *words[1:])
+        assert code == 2 and 'write joint_map: {q3: "q3 - q2"}' in said, words
     # The hint holds.
     config.write_text("\n".join([*lines, 'joint_map: {q3: "q3 - q2"}']) + "\n")
     assert cli("check", config, "--quiet")[0] == 0

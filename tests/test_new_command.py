@@ -17,6 +17,7 @@ from ccnn_torch.mechanisms.registry import REGISTRY
 from ccnn_torch.starter import starter_config
 
 Cli = Callable[..., tuple[int, str, str]]
+QUICK = ("methods=[constant]", "geometry=none", "effects=none", "save_models=false", "save_report=false")
 ARM = Path(__file__).parent.parent / "experiments" / "data" / "ur10.yaml"
 
 
@@ -58,8 +59,7 @@ def test_from_strange_headers_to_a_finished_run(tmp_path: Path, cli: Cli) -> Non
     text = config.read_text(encoding="utf-8")
     assert '"Axis_1": "q1[deg]"' in text and '"X": "x[mm]"' in text and "Not used: No" in text
     assert "# mechanism_keys: {base: " in text
-    code, _, err = cli("run", config, "methods=[constant]", "geometry=none", "save_models=false", "save_report=false",
-                       "--out", tmp_path / "run", "--quiet")  # fmt: skip
+    code, _, err = cli("run", config, *QUICK, "--out", tmp_path / "run", "--quiet")  # fmt: skip
     assert code == 0, err
     assert (tmp_path / "run" / "results.json").is_file()
     # The same config shows what the rows can show; a direction has no unit but 1.
@@ -107,8 +107,7 @@ def test_a_german_export_runs_without_a_word(tmp_path: Path, cli: Cli) -> None:
     columns = RunConfig.from_file(tmp_path / "c.yaml").columns
     assert columns["Zeit[Min]"] == "time[Min]" and columns["Anfahrt A3"] == "direction3[1]"
     assert columns["Hallentemp.[°C]"] == "temperature[°C]" and "Richtung 1" not in columns
-    code, _, err = cli("run", tmp_path / "c.yaml", "methods=[constant]", "geometry=none", "save_models=false",
-                       "save_report=false", "--out", tmp_path / "run", "--quiet")  # fmt: skip
+    code, _, err = cli("run", tmp_path / "c.yaml", *QUICK, "--out", tmp_path / "run", "--quiet")  # fmt: skip
     assert code == 0, err
     # A unit that is not read is as good as none: it is asked for, not copied.
     records.write_text(records.read_text(encoding="utf-8").replace("Grad", "grad"), encoding="utf-8")

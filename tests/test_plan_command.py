@@ -20,7 +20,7 @@ from ccnn_torch.planning.job import make_plan
 from ccnn_torch.records import load_records, read_table
 
 Cli = Callable[..., tuple[int, str, str]]
-FAST = ("candidates=400", "noise=1e-4")
+FAST = ("candidates=200", "noise=1e-4")
 
 
 def test_a_plan_is_a_file_for_the_machine_and_a_page_for_the_person(cli: Cli, tmp_path: Path) -> None:

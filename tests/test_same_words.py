@@ -14,6 +14,7 @@ from ccnn_torch.records import read_table
 from ccnn_torch.verification.job import VerifyConfig
 
 Cli = Callable[..., tuple[int, str, str]]
+QUICK = ("methods=[constant]", "geometry=none", "effects=none", "save_models=false", "save_report=false")
 PLANNED = ("candidates=300", "--quiet", "--poses", 8, "--out")
 
 
@@ -38,7 +39,7 @@ def test_the_config_of_new_goes_into_every_command(config: Path, tmp_path: Path,
         ("diagnose", config, "--out", tmp_path / "d", "--no-network", "effects=[geometry]"),
         ("identify", config, "--out", tmp_path / "i", "save_report=false"),
         ("identify", "--config", config, f"--out={tmp_path / 'j'}", "--quiet", "save_report=false"),
-        ("run", "--config", config, "--out", tmp_path / "r", "methods=[constant]", "save_report=false", "--quiet"),
+        ("run", "--config", config, "--out", tmp_path / "r", *QUICK, "--quiet"),
         ("plan", config, *PLANNED, tmp_path / "p.csv"),
         ("plan", "--config", config, "--records", tmp_path / "rows.csv", *PLANNED, tmp_path / "p.csv"),
         ("verify", tmp_path / "i" / "identified.yaml", "--config", config, "--out", tmp_path / "v"),
@@ -59,9 +60,7 @@ def test_options_stand_for_keys(config: Path, tmp_path: Path, cli: Cli) -> None:
     columns = 'columns={J1: "q1[rad]", J2: "q2[rad]", X: "x[m]"}'
     options = ("--records", rows, "--mechanism", "five_bar", "--out", tmp_path / "i", "--quiet")
     assert cli("identify", columns, *options)[0] == 0
-    assert (
-        cli("run", columns, "methods=[constant]", "save_report=false", *options[:-2], tmp_path / "r", "--quiet")[0] == 0
-    )
+    assert cli("run", columns, *QUICK, *options[:-2], tmp_path / "r", "--quiet")[0] == 0
     model = tmp_path / "i" / "identified.yaml"
     assert cli("verify", model, "--records", rows, "--out", tmp_path / "v", "--quiet")[0] in (0, 1)
     for words, sentence in (

@@ -37,6 +37,11 @@ SMALL: dict[type[Any], dict[str, Any]] = {
     GRNNRegressor: {"iterations": 4},
     ENNRegressor: {"generations": 30, "population": 20, "density": 0.7},
 }
+# And for those that fit again and again.
+TINY: dict[type[Any], dict[str, Any]] = {
+    CCNNRegressor: {"generations": 2, "population": 6, "refinement_iterations": 6},
+    ENNRegressor: {"generations": 4, "population": 8},
+}
 GRIDS: dict[type[Any], dict[str, Any]] = {
     CCNNRegressor: {"hidden": [(4,), (6, 6)]},
     BPLMRegressor: {"hidden": [(3,), (3, 3)]},
@@ -73,7 +78,7 @@ def _array_api(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SCIPY_ARRAY_API", "1")
 
 
-@parametrize_with_checks([small(kind) for kind in ESTIMATORS])
+@parametrize_with_checks([small(kind, **TINY.get(kind, {})) for kind in ESTIMATORS])
 def test_checks_of_scikit_learn(estimator: Any, check: Any) -> None:
     # The one check that asks for a score, which a small ENN does not reach.
     scored = check.func.__name__ == "check_regressors_train" and isinstance(estimator, ENNRegressor)

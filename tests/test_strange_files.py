@@ -329,7 +329,9 @@ def test_a_run_that_is_moved_with_its_data(tmp_path: Path, cli: Cli, monkeypatch
     here.mkdir()
     write_text_table(here / "r.csv", five_bar_rows())
     config = _config(here, mechanism="five_bar", methods="constant")
-    code, _, err = cli("run", config, f"out={here / 'run'}", "save_models=false", "--quiet")
+    code, _, err = cli(
+        "run", config, f"out={here / 'run'}", "geometry=none", "effects=none", "save_models=false", "--quiet"
+    )
     assert code == 0, err
     code, _, err = cli("identify", config, "methods=lm", f"out={here / 'found'}", "--quiet")
     assert code == 0, err

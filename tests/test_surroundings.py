@@ -36,15 +36,10 @@ def run(code: str, *words: str | Path, **environment: str) -> subprocess.Complet
     )
 
 
-@pytest.mark.parametrize(
-    "environment",
-    [
-        {"PYTHONIOENCODING": "cp1252"},
-        {"PYTHONIOENCODING": "ascii", "MPLBACKEND": "none such", "SOURCE_DATE_EPOCH": "yesterday"},
-    ],
-)
-def test_a_run_does_not_depend_on_them(environment: dict[str, str], tmp_path: Path) -> None:
-    done = run("", "run", TRIPOD, "methods=[constant]", "repeats=1", f"out={tmp_path / 'r'}", **environment)
+def test_a_run_does_not_depend_on_them(tmp_path: Path) -> None:
+    environment = {"PYTHONIOENCODING": "ascii", "MPLBACKEND": "none such", "SOURCE_DATE_EPOCH": "yesterday"}
+    keys = ("methods=[constant]", "repeats=1", "save_models=false", f"out={tmp_path / 'r'}")
+    done = run("", "run", TRIPOD, *keys, **environment)
     assert done.returncode == 0 and done.stderr == b"", done.stderr
     assert b" ? " in done.stdout and b"removes" in done.stdout
     assert (tmp_path / "r" / "report.html").is_file()

@@ -24,6 +24,7 @@ from ccnn_torch.report.json_files import plain
 from ccnn_torch.verification.promise import configurations, paired_gain, promise_block, promised, repeated
 
 Cli = Callable[..., tuple[int, str, str]]
+NOTHING = {"geometry": "none", "effects": "none"}
 DELTA = "delta"
 NOISE = 2e-5
 OFFSET = torch.tensor([2e-3, -1e-3, 1.5e-3], dtype=torch.float64)
@@ -69,7 +70,7 @@ def wanted(seed: int, rows: int) -> torch.Tensor:
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("model")
     rows = renamed(delta_rows(folder / "rows.csv", seed=0))
-    found = calibrate(records=str(rows), mechanism=DELTA, methods=["constant"], geometry="none", columns=COLUMNS)
+    found = calibrate(records=str(rows), mechanism=DELTA, methods=["constant"], **NOTHING, columns=COLUMNS)
     found.save(folder, forms=())
     return folder / "model.safetensors"
 

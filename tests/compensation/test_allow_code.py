@@ -144,7 +144,7 @@ def test_a_config_allows_it_by_a_key(identified: Path, ran: Callable[[], bool], 
     write_table(tmp_path / "rows.csv", dict(zip(headers, rows.T, strict=True)))
     config = tmp_path / "config.yaml"
     about = f"records: {tmp_path / 'rows.csv'}\nmechanism: {identified}\n"
-    config.write_text(f"{about}methods: [constant]\neffects: none\n")
+    config.write_text(f"{about}methods: [constant]\ngeometry: none\neffects: none\n")
     words = ("run", config, f"out={tmp_path / 'run'}", "save_models=false", "save_report=false", "--quiet")
     code, _, err = cli(*words)
     assert code == 2 and "which would run" in err and "mechanism_keys.allow_code=true" in err and not ran()

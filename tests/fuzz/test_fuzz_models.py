@@ -40,16 +40,18 @@ def models(bases, tmp_path_factory):
     (home / "plain").mkdir()
     for name in ("card.json", *FORMS):
         shutil.copy(SHIPPED / name, home / "plain")
-    rows = {"mechanism": "five_bar", "records": home / "five_bar.csv", "geometry": "none"}
+    rows = {"mechanism": "five_bar", "records": home / "five_bar.csv", "geometry": "none", "effects": "none"}
     with_covariates = calibrate(**rows, methods=["gp"], gp={"steps": 3}, covariates=["time", "temperature"])
     with_covariates.save(home / "covariates", forms=["safetensors", "onnx"])
-    rows = {"mechanism": "tripod", "records": home / "tripod.csv", "geometry": "identify"}
+    rows = {"mechanism": "tripod", "records": home / "tripod.csv", "geometry": "identify", "effects": "none"}
     calibrate(**rows, methods=["constant"], covariates=[]).save(home / "geometry", forms=["safetensors", "onnx"])
     found = {
         kind: (home / kind, FORMS, bases[name])
         for kind, name in (("plain", "tripod"), ("covariates", "five_bar"), ("geometry", "tripod"))
     }
-    identify(mechanism="tripod", records=home / "tripod.csv", methods=["lm"]).save(home / "identified")
+    identify(mechanism="tripod", records=home / "tripod.csv", methods=["lm"], save_report=False).save(
+        home / "identified"
+    )
     found["identified"] = (home / "identified", ["identified.yaml"], bases["tripod"])
     return found
 

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.fx import GraphModule, Node
-from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
@@ -19,6 +18,7 @@ from ccnn_torch.compensation.lowering import Lowering, operation_of
 from ccnn_torch.compensation.routines import ControllerFunctions, Routine, routines_of
 from ccnn_torch.compensation.targets.build import Builder
 from ccnn_torch.compensation.targets.form import BOOLEAN, Form, Program
+from ccnn_torch.compensation.targets.recording import recorded
 
 # More elements, or products, are a loop over arrays; fewer are written out, without those of zeros.
 _ELEMENTS, _PRODUCTS = 512, 1024
@@ -232,7 +232,4 @@ def traced_program(
     Raises:
         MethodFailedError: it has an operation that no form has.
     """
-    # By running it: operations on one row, those that mutate as ones that do not.
-    with torch.no_grad():
-        traced = make_fx(torch.func.functionalize(lambda *given: function(*given)), tracing_mode="real")(*example)
-    return program_of(traced, name, inputs, outputs)
+    return program_of(recorded(function, example), name, inputs, outputs)

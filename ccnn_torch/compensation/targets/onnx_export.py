@@ -17,6 +17,8 @@ import onnx
 import torch
 from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKernel
 from torch import Tensor
+from torch._guards import TracingContext, tracing
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -48,7 +50,8 @@ def rows_apart_from(module: torch.nn.Module) -> int:
 
 def traced(function: Callable[..., Any], *example: Tensor) -> GraphModule:
     """A function of tensors whose first axis is the batch, by running it."""
-    with torch.no_grad():
+    # One model of the memory for all operations: without a context each makes its own.
+    with torch.no_grad(), tracing(TracingContext(FakeTensorMode())):
         return make_fx(lambda *given: function(*given), tracing_mode="real", pre_dispatch=True)(*example)
 
 

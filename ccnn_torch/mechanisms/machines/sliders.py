@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.numerics.batching import expand_leading, stack_last
-from ccnn_torch.numerics.least_squares import jacobian_of
+from ccnn_torch.mechanisms.newton import solve
+from ccnn_torch.numerics.batching import stack_last
 
 
 class Tripod(Mechanism):
@@ -56,6 +56,20 @@ class Tripod(Mechanism):
         rho3 = torch.sqrt(l3**2 - z**2) + y + r3
         return stack_last(rho1, rho2, rho3) - offset
 
+    def _inverse_slope(self, pose: Tensor, values: Tensor) -> Tensor:
+        """Derivative of eq. 15 by the pose, `... x 3 x 3`; NaN where a root is not real."""
+        length, radius, _ = self._legs(values)
+        y, z, phi = pose.unbind(-1)
+        (l1, l2, l3), (r1, r2, _) = length.unbind(-1), radius.unbind(-1)
+        s, c = torch.sin(phi), torch.cos(phi)
+        height1, height2 = z + r1 * s, z - r2 * s
+        root1, root2 = torch.sqrt(l1**2 - y**2 - height1**2), torch.sqrt(l2**2 - y**2 - height2**2)
+        rho1 = [-y / root1, -height1 / root1, -height1 * r1 * c / root1 - r1 * s]
+        rho2 = [-y / root2, -height2 / root2, height2 * r2 * c / root2 - r2 * s]
+        slope3 = -z / torch.sqrt(l3**2 - z**2)
+        rho3 = [torch.ones_like(slope3), slope3, torch.zeros_like(slope3)]
+        return stack_last(*rho1, *rho2, *rho3).unflatten(-1, (3, 3))
+
     def _legs(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Length, radius and offset of each leg, `... x 3` [m]."""
         if len(self.geometry) == 2:
@@ -68,7 +82,15 @@ class Tripod(Mechanism):
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
         """Newton on eq. 15; NaN where it leaves the assembly mode (beyond the edge of the workspace)."""
-        pose = super().forward_kinematics(joints, parameters, guess)
+
+        def closure(pose: Tensor, joints: Tensor, values: Tensor) -> Tensor:
+            return joints - self.solve_inverse(pose, values)
+
+        def both(pose: Tensor, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+            return closure(pose, joints, values), -self._inverse_slope(pose, values)
+
+        start = self.home_pose if guess is None else guess
+        pose = solve(closure, start, (joints, self.resolve(parameters)), both=both)
         return torch.where(self.reachable(pose.detach(), parameters)[..., None], pose, torch.nan)
 
     def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
@@ -91,8 +113,8 @@ class Tripod(Mechanism):
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Real roots, and det(∂ρ/∂X) < 0: the assembly mode of the machine as built."""
-        parameters = self.resolve(parameters)
-        joints, slope = jacobian_of(lambda x: self.solve_inverse(x, parameters), expand_leading(pose, parameters))
+        values = self.resolve(parameters)
+        joints, slope = self.solve_inverse(pose, values), self._inverse_slope(pose, values)
         real = torch.isfinite(joints).all(-1)
         determinant: Tensor = torch.linalg.det(torch.where(real[..., None, None], slope, 0.0))
         return real & (determinant < 0)
