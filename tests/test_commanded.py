@@ -89,6 +89,9 @@ def test_distances_between_commanded_places(tmp_path: Path, cli: Cli, monkeypatc
         code, _, err = cli("identify", *args)
         assert code == 0, err
         found.append(load_mechanism(str(tmp_path / name / "identified.yaml")).nominal.numpy())
+        assert ("inverse kinematics of the commanded poses" in (tmp_path / name / "identified.md").read_text()) == (
+            name == "d"
+        )
     np.testing.assert_allclose(found[0], found[1], atol=1e-9)
 
 

@@ -317,8 +317,9 @@ def _residual(problem: Problem, values: Tensor) -> Tensor:
 
 def _left(problem: Problem, values: Tensor, noise: float) -> float:
     """Root mean square of the residuals of the rows with weight [m]."""
-    square = _residual(problem, values).square().mean(-1) * problem.weights
-    return max(_LEAST_NOISE, noise * math.sqrt(float(square.sum() / problem.weights.sum())))
+    square = _residual(problem, values).square().sum(-1) * problem.weights
+    count = problem.weights * (len(problem.channels) - (0 if problem.missing is None else problem.missing))
+    return max(_LEAST_NOISE, noise * math.sqrt(float(square.sum() / count.sum())))
 
 
 # An interval above this share of its prior's is the prior's. Turning machine and plates together turns the residuals,
@@ -351,7 +352,7 @@ def identify_by_constraint(
         message=fit.fit.message,
     )
     held = rows.weights == 0
-    notes = [*held_out_notes(config.split, int(held.sum())), *notes]
+    notes = [*held_out_notes(config.split, int(held.sum())), *rows.notes, *notes]
     measured = Measured(
         mechanism=mechanism,
         kinematics=Kinematics(mechanism),

@@ -14,7 +14,7 @@ from ccnn_torch.config.split import Given, rows_of_test_file, split_by, with_tes
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import BesideConfig, ConstraintConfig, IdentifyConfig
-from ccnn_torch.identification.measured import split_records
+from ccnn_torch.identification.measured import notes_of, split_records
 from ccnn_torch.mechanisms import Mechanism, as_measured
 from ccnn_torch.records import Records, Table, load_records, stack_columns
 from ccnn_torch.records.commanded import SECOND, read_joints
@@ -41,6 +41,7 @@ class ConstraintRows:
         data_hash: SHA-256 of the records.
         others: joints of the second place of each row, `s x n` [SI], where distances are between two places.
         seen: the mechanism as poses `s x p` in `said` show it; None where a constraint holds the tool.
+        notes: how the rows were read, one sentence each.
     """
 
     joints: Tensor
@@ -51,6 +52,7 @@ class ConstraintRows:
     data_hash: str
     others: Tensor | None = None
     seen: Mechanism | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def in_sockets(self) -> bool:
@@ -110,7 +112,7 @@ def rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> C
     said = torch.from_numpy(stack_columns(table, _said_columns(table, about)))[there]
     said = said if said.shape[-1] else torch.zeros(len(joints), 1, dtype=torch.float64)
     weights = torch.ones(len(joints), dtype=torch.float64)
-    return ConstraintRows(joints, said, group, labels, weights, table.data_hash, others)
+    return ConstraintRows(joints, said, group, labels, weights, table.data_hash, others, notes=table.notes)
 
 
 def _taking_part(table: Table, where: Mapping[str, float]) -> Tensor:
@@ -170,7 +172,6 @@ def poses_of(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tup
     records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
     seen = as_measured(mechanism, records.pose_coordinates, records.path)
     group, weights = torch.zeros(len(records), dtype=torch.float64), torch.ones(len(records), dtype=torch.float64)
-    rows = ConstraintRows(
-        records.joints, records.pose, group, {0.0: {"pose": 0.0}}, weights, records.data_hash, seen=seen
-    )
+    about = (group, {0.0: {"pose": 0.0}}, weights, records.data_hash)
+    rows = ConstraintRows(records.joints, records.pose, *about, seen=seen, notes=tuple(notes_of(records)))
     return rows, records

@@ -192,7 +192,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),
         joint_noise=joint_noise,
         data_hash=records.data_hash,
-        notes=[*held_out_notes(config.split, len(split.test), split), *_notes(records), *far],
+        notes=[*held_out_notes(config.split, len(split.test), split), *notes_of(records), *far],
     )
 
 
@@ -252,6 +252,6 @@ def _refuse_unseen(groups: Sequence[tuple[str, Tensor]], split: Split, records: 
             )
 
 
-def _notes(records: Records) -> list[str]:
+def notes_of(records: Records) -> list[str]:
     """Without those of columns that are no inputs here."""
     return [note for note in records.notes if not note.startswith(("ignored columns", "column '"))]
