@@ -276,7 +276,7 @@ def test_an_arm_in_the_place_of_a_config_and_many_wrong_keys_are_said_shortly(cl
     arm = tmp_path / "arm.yaml"
     arm.write_text("convention: standard\nalpha: [0]\na: [0]\n")
     code, _, err = cli("run", arm)
-    assert code == 2 and "the file of an arm" in err and f"mechanism={arm}" in err
+    assert code == 2 and "the file of a machine" in err and f"mechanism={arm}" in err
     strange = tmp_path / "strange.yaml"
     strange.write_text("".join(f"odd{k}: {k}\n" for k in range(50)))
     code, _, err = cli("run", strange)

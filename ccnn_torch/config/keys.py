@@ -116,8 +116,8 @@ def _other_command(file: str, model: type[BaseModel]) -> str:
     if not Path(file).is_file():
         return ""
     there = set(read_yaml(Path(file)))
-    if there >= {"convention", "alpha"}:
-        return f"the file of an arm, no config; write mechanism={file}"
+    if there >= {"convention", "alpha"} or "machine" in there:
+        return f"the file of a machine, no config; write mechanism={file}"
     known = set(model.model_fields)
     # A command that takes the config of a run, of records, does not fail for that.
     if getattr(model, "of_a_run", ()) and not there.isdisjoint(("records", "mechanism")):

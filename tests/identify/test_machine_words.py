@@ -54,6 +54,8 @@ def test_a_gantry_has_squareness_and_leads(seed: int, tmp_path: Path, cli: Cli) 
         assert abs(told[name, "value"] - value) < 3.5 * told[name, "sd"] < 40
     found = json.loads((out / "identified.json").read_text())["parameters"]["squareness_xy"]
     assert (found["word"], found["shown"], found["unit"]) == ("squareness xy", "um/m", "rad")
+    code, _, said = cli("identify", tmp_path / "gantry.yaml")
+    assert code == 2 and "the file of a machine, no config; write mechanism=" in said
     # The file is a machine again, with its words; a URDF would lose the leads.
     again = {p.name: p for p in load_mechanism(str(out / "identified.yaml")).geometry}
     assert again["squareness_xy"].word == "squareness xy" and not (out / "identified.urdf").exists()

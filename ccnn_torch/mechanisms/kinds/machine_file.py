@@ -33,6 +33,7 @@ _FOLDER = Path(__file__).parent
 KINDS = tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 """Names of the kinds."""
 
+_BARE = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*")
 _TOLERANCE = re.compile(r"\+-|±")
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 _FRAME = ("m", "m", "m", "rad", "rad", "rad")
@@ -107,9 +108,11 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         key: _frame(content.get(f"{key}_frame", about[f"{key}_frame"]), f"{where}: {key}_frame")
         for key in ("base", "tool")
     }
-    limits = {**about["limits"], **(content.get("limits") or {})}
-    joints = [f"q{i + 1}" for i in range(len(moves))]
-    _check_names([str(key) for key in limits], joints, f"{where}: limits:")
+    travel, joints = content.get("limits") or {}, [f"q{i + 1}" for i in range(len(moves))]
+    if not isinstance(travel, Mapping):
+        raise InputError(f"{where}: limits: must be as {{q1: [0 mm, 500 mm]}}, not {travel!r}")
+    _check_names([str(key) for key in travel], joints, f"{where}: limits:")
+    limits = {**about["limits"], **travel}
     return SerialArm(
         name=name,
         convention="urdf",
@@ -201,6 +204,9 @@ def _numbers(
                 f"{where}: numbers.{key}: '{visible(str(text))}' has two tolerances; write 250 mm +- 0.5 mm"
             )
         about = f"{where}: numbers.{key}"
+        bare = next((part for part in (value, *tolerance) if part and _BARE.fullmatch(part)), None)
+        if bare is not None and float(bare) and _shown(entry) != "1":
+            raise InputError(f"{about}: '{bare.strip()}' has no unit; write {bare.strip()} {_shown(entry)}")
         spread = _amount(tolerance[0] if tolerance else own, unit, about)
         if not 0 <= spread <= LARGEST:
             raise InputError(f"{about}: the tolerance {visible(str(tolerance[0]))} is none; write 0 or more after +-")
