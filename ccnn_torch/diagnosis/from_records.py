@@ -14,7 +14,14 @@ from torch import Tensor
 from ccnn_torch.diagnosis.checks.mistakes import what_is_wrong
 from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
-from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, frame_drift, in_time, usable_verdict
+from ccnn_torch.diagnosis.from_file import (
+    TRAINING_ROWS,
+    Verdict,
+    frame_drift,
+    in_time,
+    one_row_at_a_time,
+    usable_verdict,
+)
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.diagnosis.mount import SET_ANEW, mount_notes
 from ccnn_torch.diagnosis.residual.distance import size_of
@@ -250,11 +257,15 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
     """The entry `machine` of a diagnosis.json: effects and geometry that were named, fitted together to the rows.
 
     Where geometry is among the names, all parameters are identified, six a link of an arm. None where a model can hold
-    nothing of the verdict: no effect, one that needs the rows in order, frames per group of rows, or a simulator.
+    nothing of the verdict: no effect, one that needs the rows in order, several tools, or a simulator. A machine whose
+    rows have a base frame for each group is that in its own base.
     """
     analysis, here = said.analysis, said.analysis.situation
-    grouped = here.parameters is not None and here.parameters.dim() > 1
-    if grouped or isinstance(here.mechanism, BlackBox):
+    arm = here.mechanism
+    rows = arm.resolve(here.parameters)
+    rows = rows if rows.dim() > 1 else rows[None]
+    grouped = len(rows) > 1
+    if isinstance(arm, BlackBox) or bool((rows[:, -6:] != rows[0, -6:]).any()):
         return None
     recorded = replace(here, covariates={n: v for n, v in here.covariates.items() if n not in said.inferred})
     named = tuple((a.effect.name, _numbers(a, said)) for a in said.acting)
@@ -263,10 +274,10 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         verdict = usable_verdict(whole, recorded)[0]
         if verdict is None and drift is None:
             return None
-        situation = on_fitted_frames(recorded)
+        situation = one_row_at_a_time(recorded) if grouped else on_fitted_frames(recorded)
         identify = any(a.effect.kind == "parameters" for a in said.acting)
-        if identify and isinstance(situation.mechanism, SerialArm):
-            situation = replace(situation, mechanism=situation.mechanism.with_link_frames())
+        if identify and isinstance(arm, SerialArm):
+            situation = _in_link_frames(situation)
         known = [] if verdict is None else [k for k in verdict.on(recorded)[0] if k.effect.kind != "parameters"]
         if drift is not None:
             # Fitted beside, and left out: it is none of the machine.
@@ -277,6 +288,8 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         fine = (analysis.whitening.weight > 0) & ~analysis.near_singular
         acting, values = fit_jointly(situation, analysis.measured, known, fine, loose)
         acting = [a for a in acting if a.effect.name != FrameDrift.name]
+        if grouped:
+            situation, values = _in_own_base(situation, values[0])
         used = used_covariates(situation, acting)
         situation = replace(situation, covariates={n: v for n, v in situation.covariates.items() if n in used})
         if isinstance(situation.mechanism, Instrument):
@@ -286,6 +299,30 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
     except InputError:
         # A machine that no file describes, or an effect that needs what was before a row.
         return None
+
+
+def _in_link_frames(situation: Situation) -> Situation:
+    """An arm with six parameters a link; groups of rows keep their base frames."""
+    arm, values = situation.mechanism, situation.parameters
+    assert isinstance(arm, SerialArm)
+    if values is None or values.dim() == 1:
+        return replace(situation, mechanism=arm.with_link_frames())
+    first = arm.with_nominal(values[0])
+    assert isinstance(first, SerialArm)
+    six = first.with_link_frames()
+    parameters = torch.cat([values[:, :6], six.nominal[6:].expand(len(values), -1)], -1)
+    return replace(situation, mechanism=six, parameters=parameters)
+
+
+def _in_own_base(situation: Situation, values: Tensor) -> tuple[Situation, Tensor]:
+    """An arm of which groups of rows have base frames, without these, and its parameters so; values: in one group."""
+    arm, parameters = situation.mechanism, situation.parameters
+    assert isinstance(arm, SerialArm) and parameters is not None
+    plain: dict[str, Any] = {"frame_per": [], "tool_per": [], "unknown_frames": [], "tool_offset": None}
+    none = torch.zeros(6, dtype=values.dtype)
+    alone = SerialArm(**{**arm.recipe["keys"], **plain}).with_nominal(torch.cat([none, parameters[0, 6:]]))
+    down = rotation_vector_to_matrix(parameters[0, 3:6]).mT @ situation.gravity
+    return replace(situation, mechanism=alone, parameters=None, gravity=down), torch.cat([none, values[6:]])
 
 
 def _numbers(acting: Acting, said: Diagnosis) -> dict[str, float]:

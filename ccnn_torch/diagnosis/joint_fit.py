@@ -20,6 +20,7 @@ from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
 from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
 from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
+from ccnn_torch.diagnosis.residual.rows import fitted_frames, in_groups
 from ccnn_torch.diagnosis.residual.whitening import Whitening, device_axes, moving_channels, renewed
 from ccnn_torch.effects import Acting, Effect, Situation, measured_channels
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
@@ -35,7 +36,8 @@ _PARAMETERS = "parameters"
 
 
 class JointFit(NamedTuple):
-    """Effects with their coefficients, and the machine's parameters without those effects, `k` [SI]."""
+    """Effects with their coefficients, and the machine's parameters without those effects, `k` [SI], or `s x k` where
+    groups of rows have frames of their own."""
 
     acting: list[Acting]
     parameters: Tensor
@@ -56,7 +58,8 @@ def fit_jointly(
         loose: numbers of the parameters that are fitted beside.
 
     Returns:
-        The effects, 0 for coefficients that are not used; and all parameters.
+        The effects, 0 for coefficients that are not used; and all parameters; frames of groups of rows are fitted group
+        by group.
     """
     model = _Model(situation, known, loose)
     at, white = model.nominal.new_zeros(model.size), None
@@ -124,11 +127,24 @@ def loose_parameters(mechanism: Mechanism, identify: bool) -> list[int]:
     ]
 
 
+def _loosened(situation: Situation, loose: Sequence[int]) -> tuple[list[int], Tensor]:
+    """Numbers of the parameters that are fitted, and what each of these changes, `k x m`; where groups of rows have
+    frames of their own one for each group, `s x k x m`."""
+    eye = torch.eye(len(situation.mechanism.geometry), dtype=situation.joints.dtype)
+    if situation.parameters is None or situation.parameters.dim() == 1:
+        return [*loose], eye[:, [*loose]]
+    frames, groups = [k for frame in fitted_frames(situation) for k in frame], in_groups(situation)
+    own = [k for k in loose if k not in frames]
+    spread = torch.cat([eye[:, own].expand(len(groups), -1, -1), eye[:, frames] @ groups], -1)
+    return own + [frames[j] for j in groups.amax(0).argmax(0).tolist()], spread
+
+
 class _Model:
     """Effects and parameters as one vector of coefficients, each in plausible sizes."""
 
     def __init__(self, situation: Situation, known: Sequence[Known], loose: Sequence[int]) -> None:
-        self.situation, self.known, self.loose = situation, [*known], [*loose]
+        self.situation, self.known = situation, [*known]
+        self.loose, self.spread = _loosened(situation, loose)
         self.nominal = situation.mechanism.resolve(situation.parameters)
         geometry = situation.mechanism.geometry
         self.sizes = [scales(k.effect.coefficients(situation), self.nominal) for k in known]
@@ -149,8 +165,9 @@ class _Model:
         return [Acting(k.effect, k.shape, c) for k, c in zip(self.known, self.parts(at), strict=False)]
 
     def parameters(self, at: Tensor) -> Tensor:
-        """All of them, `k`."""
-        return self.nominal.index_add(0, torch.tensor(self.loose, dtype=torch.int64), self.parts(at)[-1])
+        """All of them, `k`, or `s x k`."""
+        changed: Tensor = self.nominal + self.spread @ self.parts(at)[-1]
+        return changed
 
     def about(self, at: Tensor, measured: Tensor, usable: Tensor) -> _Rows:
         """The rows as a linear model about the machine with these coefficients."""
@@ -159,7 +176,7 @@ class _Model:
         assert there.parameters is not None
         there = replace(there, parameters=there.parameters + parameters - self.nominal)
         columns = [self.columns(there, k) for k in self.known]
-        columns.append(there.parameter_jacobian[..., self.loose] * self.sizes[-1])
+        columns.append(there.parameter_jacobian @ self.spread * self.sizes[-1])
         every = torch.cat(columns, -1)
         left = remainder(self.situation, measured, acting, parameters)
         fine = usable & torch.isfinite(left).all(-1) & torch.isfinite(every).flatten(1).all(-1)

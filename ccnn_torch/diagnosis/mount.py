@@ -29,7 +29,7 @@ def mount_notes(said: Diagnosis, mounts: Mapping[str, Tensor], word: str) -> lis
     """
     found = {name: _turn(said, frame) for name, frame in mounts.items()}
     notes = [
-        f"{' '.join(filter(None, (word, name)))}: the first axis is tilted by AN {_arc(turn[1])} towards x and AW "
+        f"{f'{word} {name}: ' if name else ''}the first axis is tilted by AN {_arc(turn[1])} towards x and AW "
         f"{_arc(-turn[0])} towards y, and its zero is off by IA {_arc(turn[2])}"
         for name, turn in found.items()
     ]

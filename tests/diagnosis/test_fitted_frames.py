@@ -12,12 +12,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ccnn_torch.diagnosis import diagnose_rows
-from ccnn_torch.diagnosis.from_records import situation_of
+from ccnn_torch.diagnosis.from_records import named_machine, situation_of
 from ccnn_torch.diagnosis.page.outputs import write_corrected
 from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, pose_residual, reached
+from ccnn_torch.effects.found_machine import machine_of_block
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification.problems.constraints import scatter
 from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames, load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import load_records
@@ -105,6 +107,29 @@ def test_an_error_of_the_geometry_is_named_where_the_device_shows_two_points_alo
     found = diagnose_rows(situation, pose)
     assert found.verdict["effects"] == ["geometry"] and not found.verdict["outside_library"]
     assert found.gap["after"] < 0.1 * found.gap["before"]
+
+
+def test_the_machine_that_was_found_in_sockets_is_delivered_in_its_own_base() -> None:
+    """Plates stand anywhere; links and tool are the arm's, and put the ball where each socket holds it."""
+    situation, pose = _in_sockets()
+    assert situation.parameters is not None
+    # Down as the first plate has it.
+    down = rotation_vector_to_matrix(situation.parameters[0, 3:6]) @ situation.gravity
+    block = named_machine(diagnose_rows(replace(situation, gravity=down), pose))
+    assert block is not None
+    found = machine_of_block(block, "diagnosis.json")
+    arm = found.identified
+    assert isinstance(arm, SerialArm) and not arm.unknown_frames and not arm.frame_per
+    assert arm.nominal[:6].tolist() == [0.0] * 6
+    torch.testing.assert_close(found.gravity, torch.tensor([0.0, 0.0, -9.80665], dtype=torch.float64))
+    socket = torch.arange(90) % 3 * 2 + torch.arange(90) // 3 % 2
+    apart = [
+        scatter(machine.forward_frame(situation.joints)[0], socket, torch.ones(90, dtype=torch.float64))
+        for machine in (arm, found.nominal)
+        if isinstance(machine, SerialArm)
+    ]
+    after, before = (float(far.square().mean().sqrt()) for far in apart)
+    assert after < 3e-4 and before > 2e-3
 
 
 def test_a_frame_of_a_group_of_rows_acts_in_these_alone() -> None:

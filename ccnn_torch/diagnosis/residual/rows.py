@@ -72,7 +72,7 @@ def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
 
     A frame that a group of rows has for itself acts in these alone.
     """
-    index = [k for frame in _fitted_frames(situation) for k in frame]
+    index = [k for frame in fitted_frames(situation) for k in frame]
     if not index:
         return situation.jacobian[..., :0]
     return only_usable(situation.parameter_jacobian[..., index] @ in_groups(situation), usable)
@@ -85,14 +85,14 @@ def in_groups(situation: Situation) -> Tensor:
     """
     values = situation.mechanism.resolve(situation.parameters).expand(len(situation.joints), -1)
     columns, count = [], 0
-    for frame in _fitted_frames(situation):
+    for frame in fitted_frames(situation):
         number = torch.unique(values[:, frame], dim=0, return_inverse=True)[1]
         columns.append(count + number[:, None] * len(frame) + torch.arange(len(frame)))
         count += (int(number.max()) + 1) * len(frame)
     return torch.nn.functional.one_hot(torch.cat(columns, -1), count).to(values.dtype)
 
 
-def _fitted_frames(situation: Situation) -> list[list[int]]:
+def fitted_frames(situation: Situation) -> list[list[int]]:
     """Numbers of the parameters of each frame that is fitted."""
     names = [g.name.partition("_")[0] for g in situation.mechanism.geometry]
     unknown = getattr(situation.mechanism, "unknown_frames", ())
