@@ -68,7 +68,8 @@ class Tripod(Mechanism):
         rho2 = [-y / root2, -height2 / root2, height2 * r2 * c / root2 - r2 * s]
         slope3 = -z / torch.sqrt(l3**2 - z**2)
         rho3 = [torch.ones_like(slope3), slope3, torch.zeros_like(slope3)]
-        return stack_last(*rho1, *rho2, *rho3).unflatten(-1, (3, 3))
+        rows: Tensor = stack_last(*rho1, *rho2, *rho3)
+        return rows.reshape(*pose.shape[:-1], 3, 3)
 
     def _legs(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Length, radius and offset of each leg, `... x 3` [m]."""
