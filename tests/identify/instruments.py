@@ -77,8 +77,8 @@ BOARD = (turn([0.02, 0.01, 0.4]), np.array([-0.7, -0.15, 0.05]))
 CORNERS = np.array([[0.03 * i, 0.03 * j, 0.0] for i in range(5) for j in range(4)])
 
 
-def images(arm: Arm, count: int, seed: int, noise: float) -> tuple[Array, dict[str, Array]]:
-    """A camera on the flange over a board that lies under each of three elbow postures, `noise` in pixels."""
+def images(arm: Arm, count: int, seed: int, noise: float, off: Array | float = 0.0) -> tuple[Array, dict[str, Array]]:
+    """A camera on the flange over a board, `noise` in pixels; off: of the corners from where they are said to be."""
     rng = np.random.default_rng(seed)
     found: list[list[float]] = []
     taken = 0
@@ -86,7 +86,7 @@ def images(arm: Arm, count: int, seed: int, noise: float) -> tuple[Array, dict[s
         q = np.array([0, -1.2, 1.6, -1.9, -1.57, 0]) + rng.normal(0, 0.35, 6)
         rotation, place = arm.flange(q)
         turned, there = rotation @ MOUNT[0], place + rotation @ MOUNT[1]
-        seen = (BOARD[1] + CORNERS @ BOARD[0].T - there) @ turned
+        seen = (BOARD[1] + (CORNERS + off) @ BOARD[0].T - there) @ turned
         ratio = seen[:, :2] / seen[:, 2:]
         square = (ratio**2).sum(1)
         wide = 1 + LENS["k1"] * square + LENS["k2"] * square**2

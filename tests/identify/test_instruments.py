@@ -68,6 +68,36 @@ def test_pixels_of_a_board_identify_the_arm_its_mounting_and_the_lens(tmp_path: 
     torch.testing.assert_close(again.nominal, machine.nominal, rtol=0, atol=1e-12)
 
 
+def test_corners_of_a_board_that_is_not_as_drawn_are_found_along(tmp_path: Path) -> None:
+    """Half a millimetre of a printer's paper: without the corners as unknowns it would be the arm's."""
+    off = np.random.default_rng(7).normal(0, 3e-4, CORNERS.shape) * [1, 1, 0]
+    keys = _camera(tmp_path)
+    q, columns = images(Arm(0), 25, 0, 0.2, off)
+    number = np.arange(len(q)) % len(CORNERS) + 1.0
+    write(tmp_path / "board.csv", q, {**columns, "corner[1]": number})
+    plain = identify(**keys, seed=0).results["test"]["position"]["after"]
+    keys["mechanism_keys"] |= {"corners": len(CORNERS), "board_tolerance": 3e-4}
+    found = identify(**keys, noise="0.2 px", seed=0)
+    after = found.results["test"]["position"]["after"]
+    assert after < 1.4 * math.sqrt(2) * 0.2 * PIXEL < 0.6 * plain
+    machine = found.mechanism()
+    values = dict(zip((p.name for p in machine.geometry), machine.nominal.tolist(), strict=True))
+    corners = np.array([[values[f"corner{i + 1}_{a}"] for a in "xy"] for i in range(len(CORNERS))])
+    # But for what moves with the board, its turn and its size.
+    assert _apart(list(CORNERS + off), list(CORNERS + np.pad(corners, ((0, 0), (0, 1))))) < 1.5e-4
+
+
+def test_a_level_on_a_link_shows_what_is_before_it(tmp_path: Path) -> None:
+    q = joints(60, 1)
+    machine = load_mechanism("instrument", mechanism=str(arm_file(tmp_path, False)), kind="level", link=3)
+    place = load_mechanism(str(arm_file(tmp_path, False)))
+    rotation = place.link_frames(torch.from_numpy(q), place.nominal)[3][0]
+    expected = np.arcsin(rotation[:, 2, :2].numpy())
+    np.testing.assert_allclose(machine.forward_kinematics(torch.from_numpy(q)).numpy(), expected, atol=1e-12)
+    later = machine.jacobian(torch.from_numpy(q))[..., 3:]
+    assert float(later.abs().max()) < 1e-12
+
+
 def test_a_camera_that_stands_sees_a_board_on_the_hand() -> None:
     """The same images: a camera on the hand that sees a board is a board that sees a camera, the other way round."""
     arm = load_mechanism("serial", name="one", convention="standard", links=[[0.1, 0.2, 0.3, 0.0]] * 3)
@@ -103,6 +133,16 @@ def test_commands_from_pixels_bring_the_true_arm_to_its_poses(tmp_path: Path) ->
     reached = [np.array([camera_pose(Arm(0), v) for v in command]) for command in commands]
     before, after = (float(np.sqrt(((r - wanted)[:, :3] ** 2).sum(1).mean())) for r in reached)
     assert after < 2.5e-4 and after < 0.15 * before
+
+
+def _apart(wanted: list[Array], reached: list[Array]) -> float:
+    """RMS of what a rigid motion and a size leave between points (Kabsch, Umeyama)."""
+    one, other = np.array(wanted), np.array(reached)
+    one, other = one - one.mean(0), other - other.mean(0)
+    left, size, right = np.linalg.svd(other.T @ one)
+    sign = np.array([1, 1, np.linalg.det(left @ right)])
+    fitted = (size * sign).sum() / (other**2).sum() * other @ (left * sign) @ right
+    return float(np.sqrt(((fitted - one) ** 2).sum(1).mean()))
 
 
 def _wire(folder: Path, arm: Arm, q: Array, seed: int) -> Path:

@@ -20,6 +20,8 @@ from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 _FOCUS, _DISTORTION, _PLACE, _TURN = 0.01, 0.05, 0.02, 0.05
 PIXEL = 1e-6
 """A pixel counts as this length on the image [m], as columns in px are read."""
+# Numbers of a lens.
+_LENS = 6
 # Nothing is seen nearer to a camera than this [m].
 _BEHIND = 1e-3
 
@@ -95,12 +97,19 @@ class Camera(Reading):
         k2: float = 0.0,
         on_hand: bool = True,
         refine: bool = True,
+        corners: int = 0,
+        board_tolerance: float = 2e-4,
     ) -> None:
-        """Focal lengths and centre in pixels, k1, k2 of the normalised radius [1]; fitted to the rows with `refine`."""
+        """Focal lengths and centre in pixels, k1, k2 of the normalised radius [1]; fitted to the rows with `refine`.
+
+        A board whose corners are known only to `board_tolerance` [m] has so many `corners`, which the column `corner`
+        numbers from 1.
+        """
+        self.corners = _count(corners, "corners") if corners else 0
         self.on_hand, self.unknown = on_hand, ("camera",) if refine else ()
         focus = fx if fy is None else fy
         self.keys = {"fx": fx, "cx": cx, "cy": cy, "fy": focus, "k1": k1, "k2": k2, "on_hand": on_hand}
-        self.keys["refine"] = refine
+        self.keys |= {"refine": refine, "corners": corners, "board_tolerance": board_tolerance}
         pixels, share = {"fx": fx, "fy": focus, "cx": cx, "cy": cy}, {"k1": k1, "k2": k2}
         self.parameters = (
             *(
@@ -108,15 +117,25 @@ class Camera(Reading):
                 for n, v in pixels.items()
             ),
             *(Parameter(f"camera_{n}", "1", v, scale=_DISTORTION, cause="camera") for n, v in share.items()),
+            *(
+                Parameter(f"corner{i + 1}_{axis}", "m", 0.0, scale=board_tolerance)
+                for i in range(self.corners)
+                for axis in "xyz"
+            ),
         )
+        if self.corners:
+            self.given, self.usual = (*self.given, Coordinate("corner", "1")), (*self.usual, 1.0)
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
         assert place.rotation is not None
+        point = given[..., :3]
+        if self.corners:
+            point = point + _chosen(own[..., _LENS:], given[..., 3], 3)
         if self.on_hand:
-            seen = (place.rotation.mT @ (given - place.position)[..., None])[..., 0]
+            seen = (place.rotation.mT @ (point - place.position)[..., None])[..., 0]
         else:
-            seen = (place.rotation @ given[..., None])[..., 0] + place.position
-        fx, fy, cx, cy, k1, k2 = own.unbind(-1)
+            seen = (place.rotation @ point[..., None])[..., 0] + place.position
+        fx, fy, cx, cy, k1, k2 = own[..., :_LENS].unbind(-1)
         deep = seen[..., 2]
         ratio = seen[..., :2] / torch.where(deep > _BEHIND, deep, torch.nan)[..., None]
         square = ratio.square().sum(-1)
@@ -125,13 +144,13 @@ class Camera(Reading):
 
     def frames(self, joints: Tensor, rows: Tensor, own: Tensor) -> tuple[Tensor, Tensor | None]:
         """By the board's corners in each image."""
-        fx, fy, cx, cy, k1, k2 = own.unbind(-1)
+        fx, fy, cx, cy, k1, k2 = own[:_LENS].unbind(-1)
         ratio = torch.stack([(rows[:, 0] - cx) / fx, (rows[:, 1] - cy) / fy], -1)
         plain = ratio
         for _ in range(20):
             square = plain.square().sum(-1, keepdim=True)
             plain = ratio / (1 + k1 * square + k2 * square.square())
-        return board_poses(joints, plain, rows[:, 2:], self.on_hand)
+        return board_poses(joints, plain, rows[:, 2:5], self.on_hand)
 
 
 class Wire(Reading):
