@@ -34,7 +34,8 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     Needed: `dof`, `convention` (starts with one of the two known), `units: {length, angle}`, `a`, `alpha`, `d`,
     `theta`. Optional: `joint_types` (revolute), `joint_sign` (+1), `parallel_axes`, `base_frame` and `tool_frame`
     (a text with "unknown", "identity", or [x, y, z, rx, ry, rz]; unknown when missing), `tool_offset` (likewise, but
-    [x, y, z]; replaces the tool frame for records without orientation), `frame_per`, `tool_per`, `robot` (its name).
+    [x, y, z]; replaces the tool frame for records without orientation), `goal_tool` (the frame that commanded poses are
+    of, where it is not the measured one), `frame_per`, `tool_per`, `robot` (its name).
 
     Args:
         path: the file.
@@ -65,6 +66,7 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     scales = [length] * 3 + [angle] * 3
     base, tool = table.frame("base_frame", scales), table.frame("tool_frame", scales)
     offset = table.frame("tool_offset", scales[:3]) if "tool_offset" in table.content else None
+    goal = table.frame("goal_tool", scales) if "goal_tool" in table.content else None
     return SerialArm(
         name=visible(str(table.content.get("robot", Path(path).stem)), 60),
         convention=convention,
@@ -79,6 +81,7 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
         tool_per=table.words("tool_per", []),
         parallel_axes=table.groups("parallel_axes", n),
         orientation=orientation,
+        goal_tool=goal,
     )
 
 

@@ -192,6 +192,7 @@ class SerialArm(Mechanism):
         rotation_weight: float = 0.04,
         drives: Sequence[Sequence[int]] = (),
         numbers: Sequence[Mapping[str, Any]] = (),
+        goal_tool: Sequence[float] | None = None,
     ) -> None:
         """Build from plain numbers [SI].
 
@@ -204,6 +205,7 @@ class SerialArm(Mechanism):
             axes: joint axes in the link's frame, `n x 3`; z when None.
             base, tool: frames, position and rotation vector.
             tool_offset: position of the tool, or "unknown"; replaces `tool` where the pose has no orientation.
+            goal_tool: the tool that commanded poses are of, position and rotation vector; `tool` when None.
             limits: lowest and highest value per joint, for sampling only; a full turn or a metre when None.
             unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight, drives: see the class.
             numbers: fields of a `Parameter`, and `of`: what one unit of it adds to links' and drives' parameters, by
@@ -213,6 +215,7 @@ class SerialArm(Mechanism):
             InputError: unknown convention or orientation.
         """
         keys = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        keys = keys if goal_tool else {k: v for k, v in keys.items() if k != "goal_tool"}
         if convention not in LINKS or orientation not in ("rotation_vector", "none", "direction"):
             raise InputError(
                 f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector', 'none' or "
@@ -309,17 +312,24 @@ class SerialArm(Mechanism):
         rotations, places = self.link_transforms(zero, self.nominal)
         angles = matrix_to_euler_zyx(rotations).flip(-1)
         links = torch.cat([places, angles], dim=-1)
-        tool_rotation, tool = rotation_vector_to_matrix(self.nominal[-3:]), self.nominal[-6:-3]
+        before = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
         if self._axis_before:
             links = torch.cat([torch.zeros_like(links[:1]), links[:-1]])
-            tool_rotation, tool = compose((rotations[-1], places[-1]), (tool_rotation, tool))
+            before = rotations[-1], places[-1]
+
+        def from_last(frame: Tensor) -> list[float]:
+            turn, place = compose(before, (rotation_vector_to_matrix(frame[3:]), frame[:3]))
+            return [*place.tolist(), *matrix_to_rotation_vector(turn).tolist()]
+
+        goal = keys.get("goal_tool")
         return SerialArm(
             **{
                 **keys,
                 "convention": "urdf",
                 "links": links.tolist(),
                 "base": self.nominal[:6].tolist(),
-                "tool": [*tool.tolist(), *matrix_to_rotation_vector(tool_rotation).tolist()],
+                "tool": from_last(self.nominal[-6:]),
+                "goal_tool": None if goal is None else from_last(torch.tensor(goal, dtype=torch.float64)),
                 "tool_offset": None,
                 "unknown_frames": list(self.unknown_frames),
             }
@@ -335,8 +345,9 @@ class SerialArm(Mechanism):
 
     def controlled(self) -> SerialArm:
         """The arm of its file in its own base; at the flange where its tool is unknown. Poses have an orientation."""
+        keys = self.recipe["keys"]
         known = {"base": (0.0,) * 6, "tool_offset": None, "unknown_frames": (), "orientation": "rotation_vector"}
-        return SerialArm(**{**self.recipe["keys"], **known})
+        return SerialArm(**{**keys, **known, "tool": keys.get("goal_tool") or keys["tool"]})
 
     def commanded_joints(self, pose: Tensor, guess: Tensor | None = None) -> Tensor:
         """See `Mechanism.commanded_joints`; of three joints the positions `s x 3` are enough."""
