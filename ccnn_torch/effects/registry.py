@@ -393,7 +393,8 @@ def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
 
 def effect_names(mechanism: Mechanism) -> list[str]:
     """Of the library's effects that such a machine may have, and of the causes that its own parameters name."""
-    library = [name for name in EFFECTS if name != Flexure.name or sees_directions(mechanism)]
+    without = ("gravity", "tool", "instrument") if sees_directions(mechanism) else (Flexure.name,)
+    library = [name for name in EFFECTS if name not in without]
     return [*library, *(e.name for e in parameter_causes(mechanism))]
 
 

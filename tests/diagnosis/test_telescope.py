@@ -104,3 +104,9 @@ def test_what_is_set_anew_each_night_is_told(tmp_path: Path) -> None:
         assert abs(bent[name][0] - wanted) < 4 * bent[name][1]
     assert said.gap["after"] == pytest.approx(math.sqrt(1 + 1.5**2) * NOISE * ARCSECOND, rel=0.15)
     assert arcseconds(said, "from one night") == pytest.approx([10.0, 17.0, 20.0], abs=1.0)
+
+
+def test_a_mount_has_no_causes_of_positions_and_is_seen_across_and_along(tmp_path: Path) -> None:
+    said = diagnosed(tmp_path, {1: night(7, 60, IA=50.0, IE=10.0)})
+    assert set(said.where["outputs"]) == {"across", "along"}
+    assert not {"gravity", "tool", "instrument"} & ({e["name"] for e in said.effects} | set(said.not_seen))

@@ -75,11 +75,10 @@ def check_rows(
             weak[atom.name] = size
     why = why_set_aside(analysis, rows, chosen)
     condition = situation.mechanism.condition_number(situation.joints[keep], parameters=situation.parameters)
-    names = ("x", "y", "z", "rx", "ry", "rz")
     return Check(
         rows=len(rows.fine),
         aside=sorted(why),
-        noise={names[int(c)]: float(s) for c, s in zip(white.channels, white.sigma, strict=True)},
+        noise=dict(zip(white.names, white.sigma.tolist(), strict=True)),
         covariates=[n for n, v in situation.covariates.items() if float(v.max() - v.min()) > 0],
         missing=lacking | dict.fromkeys(analysis.idle, UNSHOWN),
         weak=weak,

@@ -12,6 +12,7 @@ from torch import Tensor
 from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import sees_directions
 
+_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 # Degrees of freedom of the row weights (Student t), and beyond how many times its noise a row is set aside.
 _DEGREES = 4.0
 _GROSS = 6.0
@@ -48,6 +49,11 @@ class Whitening:
     known: float
     seen: Tensor | None = None
     axes: Tensor | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """What the channels are called."""
+        return ["across", "along"] if self.axes is not None else [_NAMES[int(c)] for c in self.channels]
 
     def __call__(self, values: Tensor) -> Tensor:
         """`s x c0` or `s x c0 x m` raw to `s x c` or `s x c x m`, in units of the noise, rows weighted."""

@@ -14,7 +14,6 @@ from ccnn_torch.effects import Situation
 from ccnn_torch.evidence.shrink import INTERVAL, draws
 from ccnn_torch.mechanisms import SerialArm
 
-_AXES = ("x", "y", "z", "rx", "ry", "rz")
 # Rows from which on each of two coordinates is cut in three and not in two.
 _MANY = 300
 
@@ -68,7 +67,7 @@ def localise(analysis: Analysis, residual: Tensor, seed: int = 0) -> tuple[dict[
     drawn = _Drawn(analysis, seed)
     outputs = drawn.shares(_Parts(y.square(), torch.ones_like(y)))
     joints = drawn.shares(_joints(analysis, y, keep))
-    axes, names = [_AXES[int(c)] for c in white.channels], [j.name for j in situation.mechanism.joints]
+    axes, names = white.names, [j.name for j in situation.mechanism.joints]
     legged = any(g.leg is not None for g in situation.mechanism.geometry)
     legs = [f"leg {i + 1}" for i in range(len(names))] if legged else []
     places, inside = _regions(analysis, keep)
