@@ -84,8 +84,8 @@ class Camera(Reading):
     note = "A pixel counts as 1 µm on the image: every µm of a position here is a pixel."
     turns = True
     read = (Coordinate("u", "m"), Coordinate("v", "m"))
-    given = tuple(Coordinate(f"board_{axis}", "m") for axis in "xyz")
-    usual = (0.0, 0.0, 0.0)
+    given: tuple[Coordinate, ...] = tuple(Coordinate(f"board_{axis}", "m") for axis in "xyz")
+    usual: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __init__(
         self,
