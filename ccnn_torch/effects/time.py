@@ -368,7 +368,7 @@ class FrameDrift(Effect):
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """When it begins and how fast it settles."""
         whole = max(float(_passed(situation).max()), 1e-6)
-        unit = "s" if "time" in situation.covariates else "1"
+        unit = "s" if "time" in situation.covariates else ""
         begins = tuple(whole * k / _BEGINS for k in range(_BEGINS))
         settlings = tuple(whole * share for share in _SETTLINGS)
         return (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import combinations
 
@@ -125,3 +126,16 @@ def test_what_does_not_act_keeps_few_shapes_and_that_of_the_textbook() -> None:
         assert any(has_usual_shape(situation, atom) for atom in shapes[name]), name
     # One found beside the gain, the likeliest of those found at first, and that of the textbook.
     assert max(len(atoms) for atoms in shapes.values()) <= 3 and len(shapes["drift"]) <= 2
+
+
+def test_a_period_that_explains_the_gap_alone_stays_beside_what_suits_the_noise() -> None:
+    situation = rows_of("five_bar", 400, 0)
+    middle = situation.joints.median(0).values
+    near = ((situation.joints - middle).abs() < math.pi / 3).all(-1)
+    situation = replace(situation, joints=situation.joints[near], guess=situation.pose[near], covariates={})
+    eccentric = torch.zeros_like(situation.joints)
+    eccentric[:, 0] = 4e-4 * torch.sin(situation.joints[:, 0])
+    pose = situation.mechanism.forward_kinematics(situation.joints + eccentric, None, situation.pose)
+    pose = pose + 1e-5 * torch.randn(pose.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    atoms = diagnose_rows(situation, pose).analysis.atoms
+    assert any(a.name == "transmission" and float(a.shape[0]) == 1.0 and 0 in (a.used or (0,)) for a in atoms)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.diagnosis import diagnose
 from ccnn_torch.diagnosis.engine import diagnose_rows
+from ccnn_torch.diagnosis.verdict.findings import findings
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records
@@ -81,6 +82,10 @@ def _frame(twist: Array) -> Array:
     return at
 
 
+def _row_of(text: str) -> int:
+    return int(text.partition("(from row ")[2].split()[0])
+
+
 def _creeping(share: Array) -> Array:
     return share
 
@@ -122,6 +127,8 @@ def test_a_drift_of_the_frame_is_named_beside_geometry_with_its_numbers(tmp_path
             first = int(np.argmax(_touched(arm.time / arm.time[-1])))
             assert moments[first - 2] <= found["begin"]["value"] <= moments[first + 1]
             assert found["settling"]["value"] < moments[2]
+            text = next(f.text for f in findings(said.content) if f.effect == "frame_drift")
+            assert "after the first row on" in text if timed else abs(_row_of(text) - (first + 1)) <= 1
     assert right >= len(_CASES) - 1
 
 
@@ -173,6 +180,7 @@ def test_commands_are_not_corrected_for_a_frame_that_moved(cli: Cli, tmp_path: P
     assert np.sqrt(np.mean(np.sum((position - wanted) ** 2, -1))) < min(3e-5, 0.2 * moved)
 
     about = (f"records={records}", f"mechanism={file}", "repeats=1", "methods=constant", "--quiet")
+    about += ("geometry=identify", "save_models=false")
     left: dict[str, float] = {}
     for effects in ("auto", f"from:{tmp_path}/d/diagnosis.json", "none"):
         out = tmp_path / f"r{len(left)}"

@@ -32,7 +32,8 @@ def without_frame_drift(
         The records; the verdict without the drift, None where it then names nothing; and notes.
     """
     others, drift = verdict.of_machine()
-    if drift is None:
+    # Frames by group of rows are refused beside effects.
+    if drift is None or getattr(mechanism, "frame_per", ()) or getattr(mechanism, "tool_per", ()):
         return records, verdict, []
     recorded = situation_of(records, mechanism)
     situation = in_time(on_fitted_frames(recorded), moments(records))

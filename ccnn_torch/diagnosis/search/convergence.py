@@ -82,14 +82,20 @@ def discrepancy_is_active(dictionary: Dictionary, found: Sequence[FittedSet], be
 
 
 def most_probable_shapes(atoms: Sequence[Atom], found: Sequence[FittedSet]) -> dict[str, Atom]:
-    """The most probable atom of every effect that has shapes, by name.
+    """The atom of every effect that has shapes, by name, in the most probable set that is less so without it.
+
+    Beside a set that is as probable without it an effect has what suits the noise: that counts only where it takes part
+    in no set.
 
     Args:
         atoms: candidates.
         found: sets that were tried, most probable first.
     """
+    tried = {f.members: f.log_posterior for f in found}
+    parts = [(f, i, other) for f in found for i, other in zip(f.members, subsets_with_one_less(f.members), strict=True)]
+    takes_part = [i for f, i, other in parts if f.log_posterior > tried.get(other, math.inf)]
     first: dict[str, Atom] = {}
-    for atom in (atoms[i] for one in found for i in one.members):
+    for atom in (atoms[i] for i in (*takes_part, *(i for _, i, _ in parts))):
         if atom.effect is not None and atom.shape.numel():
             first.setdefault(atom.name, atom)
     return first

@@ -74,6 +74,11 @@ def findings(results: Block) -> list[Finding]:
             text += f": {sizes[''][1].removeprefix(f'{words.short} ')}"
         lag = parameters.get("lag", {}).get("value")
         text += f" (settling in {size_words(lag, 's')})" if lag else ""
+        begin = parameters.get("begin")
+        if begin is not None and begin["value"] > 0:
+            # Without times it is a row's number, from 0.
+            row, since = f"row {int(begin['value']) + 2}", f"{size_words(begin['value'], 's')} after the first row"
+            text += f" (from {since if begin['unit'] else row} on)"
         like = [
             n for n in by_name.get(name, {}).get("indistinguishable_from", ()) if n not in results["verdict"]["effects"]
         ]
