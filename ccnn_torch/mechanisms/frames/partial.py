@@ -174,7 +174,8 @@ def completed(mechanism: Mechanism, joints: Tensor, pose: Tensor, parameters: Te
     """Poses `... x p` with what was not measured (NaN) as the machine has it at the joints."""
     if not bool(pose.isnan().any()):
         return pose
-    return torch.where(pose.isnan(), mechanism.forward_kinematics(joints, parameters), pose)
+    guess = torch.where(pose.isnan(), mechanism.home_pose, pose)
+    return torch.where(pose.isnan(), mechanism.forward_kinematics(joints, parameters, guess), pose)
 
 
 def as_measured(mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "records") -> Mechanism:
