@@ -180,3 +180,15 @@ def test_a_run_learns_from_whole_poses_and_identifies_from_all(tmp_path: Path) -
     assert before > 1e-3 and after < 0.1 * before, (before, after)
     block = found.results.pose.position
     assert block.after.rms.median < 3e-5, block
+
+
+def test_joints_of_a_part_of_a_pose_are_not_compared(tmp_path: Path) -> None:
+    machine, _, joints, pose, held = printer(0)
+    file = str(write(tmp_path / "r.csv", machine, joints, pose))
+    keys = {"records": file, "mechanism": "delta_linear", "parameters": {"fixed": held}}
+    for more, word in (
+        ({"residual": "inverse"}, "residual: inverse"),
+        ({"methods": ["lm_per_leg"]}, "methods: leg by leg"),
+    ):
+        with pytest.raises(InputError, match=f"{word} compares joints, which only a whole pose has"):
+            identify(**keys, **more)

@@ -158,7 +158,8 @@ def measured_channels(situation: Situation, measured: Tensor) -> Tensor | None:
     """
     if not bool(measured.isnan().any()):
         return None
-    return ~((situation.frame_slope != 0) & measured.isnan()[:, None, :]).any(-1)
+    moving = situation.frame_slope != 0
+    return ~(moving & measured.isnan()[:, None, : moving.shape[-1]]).any(-1)
 
 
 def filled(situation: Situation, measured: Tensor) -> Tensor:

@@ -105,10 +105,11 @@ def _problem(
     measured: Measured, config: IdentifyConfig, rows: Rows, machines: Tensor, per_leg: bool, near: Tensor | None
 ) -> Problem:
     gaps = bool(rows.observed.isnan().any())
-    if gaps and config.residual == "inverse":
+    if gaps and (config.residual == "inverse" or per_leg):
+        key, give = ("methods", "leg by leg") if per_leg else ("residual", "inverse")
         raise InputError(
-            "residual: inverse compares joints, which only a whole pose has, and some rows lack a part of it; write "
-            "residual=auto, or leave these rows out"
+            f"{key}: {give} compares joints, which only a whole pose has, and some rows lack a part of it; write "
+            "residual=auto and methods=[lm], or leave these rows out"
         )
     about = gaps or compares_poses(measured.mechanism) or config.frame.base or config.frame.tool
     forward = config.residual == "forward" or (config.residual == "auto" and about)

@@ -180,7 +180,7 @@ def forward_problem(
     rest = [i for i in range(mechanism.compared) if i not in turning]
     order = [*rest, *turning]
     turns = (rotation_vector_to_matrix(rows.pose[..., turning]).flatten(-2),) if turning else ()
-    seen = None if bool(known.all()) else known[..., order].reshape(-1, *rows.pose.shape[-2:])
+    seen = None if bool(known.all()) else known[..., order].reshape(-1, rows.pose.shape[-2], len(order))
 
     def difference(full: Tensor, q: Tensor, x: Tensor, *measured: Tensor) -> Tensor:
         """In the order of `order`."""

@@ -203,8 +203,8 @@ def completed(mechanism: Mechanism, joints: Tensor, pose: Tensor, parameters: Te
     """Poses `... x p` with what was not measured (NaN) as the machine has it at the joints."""
     if not bool(pose.isnan().any()):
         return pose
-    given = pose if mechanism.compared < pose.shape[-1] else None
-    return torch.where(pose.isnan(), mechanism.forward_kinematics(joints, parameters, given), pose)
+    guess = torch.where(pose.isnan(), mechanism.home_pose, pose)
+    return torch.where(pose.isnan(), mechanism.forward_kinematics(joints, parameters, guess), pose)
 
 
 # Share of the usual length by which the lengths of unit vectors differ.
