@@ -300,8 +300,8 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
     else:
         mechanism = _call(spec, maker, keys)
-    own = ("machine", "framed", "partial", "instrument", "pair")
-    if (spec in REGISTRY or is_plugin(spec)) and spec not in own and not isinstance(mechanism, Framed | Seen | Pair):
+    plain = spec != "machine" and (spec in REGISTRY or is_plugin(spec))
+    if plain and not isinstance(mechanism, Framed | Seen | Pair):
         mechanism.recipe = {"spec": spec, "keys": keys}
     return mechanism
 
