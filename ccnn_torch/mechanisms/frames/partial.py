@@ -167,7 +167,7 @@ class Partial(Mechanism):
 
 
 # Share of the usual length by which the lengths of unit vectors differ.
-_UNIT = 1e-6
+_UNIT = 1e-5
 
 
 def as_measured(
