@@ -22,10 +22,9 @@ from ccnn_torch.evidence.priors import EFFECT
 
 # What it costs to be told with secondary coefficients or without.
 _EITHER = math.log(2.0)
-
-
-# Columns of a coupling: of eight pairs with their zeros, or of all pairs of four joints.
-_MOST_COUPLED = 16
+# Columns of a coupling from which each one more is a cause of its own: of eight pairs with their zeros, or of all pairs
+# of four joints.
+_FEW_COUPLED = 16
 
 
 class Known(NamedTuple):
@@ -82,7 +81,7 @@ def candidates_about_nominal(
         for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(without_unused_rows(_atom(situation, situation, atom.effect, shaped), usable))
-    return [*filter(_is_plausible, [*whole, *parts]), *starts]
+    return [*map(_charged, [*whole, *parts]), *starts]
 
 
 def candidates_about_set(
@@ -138,7 +137,7 @@ def candidates_about_set(
     for part in single_joint_atoms(situation, asked, white, left):
         if part is not None:
             parts.setdefault((part.name, part.used), part)
-    atoms = [*filter(_is_plausible, [*whole, *parts.values(), *without_secondary(situation, whole)])]
+    atoms = [*map(_charged, [*whole, *parts.values(), *without_secondary(situation, whole)])]
     for effect in (e for e in effects if e.shapes(situation)):
         others = [a for a in acting if a.effect is not effect]
         start = next((a.shape for a in acting if a.effect is effect), None)
@@ -175,9 +174,11 @@ def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
     return [Shaped(torch.tensor(usual, dtype=situation.joints.dtype), None, 0.0)]
 
 
-def _is_plausible(atom: Atom) -> bool:
-    """Whether a machine may have an atom: no arm has a belt from every joint to every other one."""
-    return not (isinstance(atom.effect, Coupling) and atom.columns.shape[-1] > _MOST_COUPLED)
+def _charged(atom: Atom) -> Atom:
+    """A coupling of many pairs of joints with the cost of a cause for each: no arm has a belt from every joint to every
+    other one, and such a set of belts fits whatever a device does smoothly."""
+    more = atom.columns.shape[-1] - _FEW_COUPLED if isinstance(atom.effect, Coupling) else 0
+    return replace(atom, log_prior=atom.log_prior + more * EFFECT) if more > 0 else atom
 
 
 def has_usual_shape(situation: Situation, atom: Atom) -> bool:
@@ -203,13 +204,11 @@ class _Choice:
         parts: numbers of the coefficients of each joint or leg.
         own: products of all of the columns among themselves and with what is to be explained.
         squares: of what is to be explained, 0-dim.
-        most: parts that may be chosen.
     """
 
     parts: list[list[int]]
     own: GroupProducts
     squares: Tensor
-    most: int
     chosen: list[int] = field(default_factory=list)
     lots: int = 0
     reached: float = -math.inf
@@ -227,7 +226,7 @@ class _Choice:
             self.done = True
             return
         self.chosen, self.reached, self.lots = wider, float(evidence[best]), self.lots + 1
-        self.done = self.lots >= self.most
+        self.done = self.lots >= max(len(self.parts) // 2, 1)
 
     @property
     def charge(self) -> float:
@@ -252,10 +251,7 @@ def single_joint_atoms(
         parts = _parts(situation, atom)
         if len(parts) > 1:
             target = white(residual)
-            most = max(len(parts) // 2, 1)
-            if isinstance(atom.effect, Coupling):
-                most = min(most, _MOST_COUPLED // 2)
-            choices[k] = _Choice(parts, own_products(white(atom.columns), target), target.square().sum(), most)
+            choices[k] = _Choice(parts, own_products(white(atom.columns), target), target.square().sum())
     while going := [c for c in choices.values() if not c.done]:
         cut = [[GroupProducts(c.own.xx[p][:, p], c.own.xy[p]) for p in c.wider()] for c in going]
         counts = [len(group) for group in cut]

@@ -208,7 +208,7 @@ def completed(mechanism: Mechanism, joints: Tensor, pose: Tensor, parameters: Te
 
 
 # Share of the usual length by which the lengths of unit vectors differ.
-_UNIT = 1e-6
+_UNIT = 1e-5
 
 
 def as_measured(
