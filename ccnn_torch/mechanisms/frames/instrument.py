@@ -148,7 +148,7 @@ class Instrument(Seen):
         count = len(self.mechanism.geometry)
         unknown = self.unknown_frames
         free = [k for k, g in enumerate(self.geometry) if g.name.partition("_")[0] in unknown]
-        used = weights > 0
+        used = (weights > 0) & ~pose.isnan().any(-1)
         if not free:
             return start
         if int(used.sum()) * self.compared < len(free):
