@@ -179,8 +179,8 @@ def test_commands_are_not_corrected_for_a_frame_that_moved(cli: Cli, tmp_path: P
     moved = np.linalg.norm(arm.twist[:3])
     assert np.sqrt(np.mean(np.sum((position - wanted) ** 2, -1))) < min(3e-5, 0.2 * moved)
 
-    about = (f"records={records}", f"mechanism={file}", "repeats=1", "methods=constant", "--quiet")
-    about += ("geometry=identify", "save_models=false")
+    about = [f"records={records}", f"mechanism={file}", "repeats=1", "methods=constant", "--quiet"]
+    about += ["geometry=identify", "save_models=false"]
     left: dict[str, float] = {}
     for effects in ("auto", f"from:{tmp_path}/d/diagnosis.json", "none"):
         out = tmp_path / f"r{len(left)}"

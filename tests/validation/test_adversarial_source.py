@@ -12,7 +12,7 @@ from ccnn_validation.sources.adversarial.rig import ALL, draw_rig
 
 _NAMES = {
     *("geometry", "joint_offset", "joint_gain", "transmission", "backlash", "friction", "compliance", "gravity"),
-    *("thermal", "drift", "frame", "tool", "coupling", "latency", "instrument", "outlier", "jump"),
+    *("thermal", "drift", "frame", "tool", "coupling", "latency", "frame_drift", "instrument", "outlier", "jump"),
 }
 _KINDS = {"none", "single", "pair", "several", "outside", "data"}
 

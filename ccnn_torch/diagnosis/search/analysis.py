@@ -223,6 +223,7 @@ def _about_nominal(situation: Situation, measured: Tensor, effects: Sequence[Eff
     # What does not show at all in these rows is no candidate (latency at rest).
     channels = moving_channels(situation)
     largest = residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)
+    atoms = [a for a in atoms if a.columns.shape[-1]]
     atoms = [a for a in atoms if float((a.columns[:, channels] / largest[:, None]).abs().max()) > _SHOWN]
     everything = [a.columns for a in (*atoms, *rest) if not (a.is_discrepancy and a.name.startswith("joint"))]
     seen = measured_channels(situation, measured)

@@ -69,9 +69,11 @@ def _gated(rig: Rig, effect: Effect, state: Array) -> Effect:
 def _jump_truth(rig: Rig, cause: str, effect: Effect) -> Truth:
     """Outside by the time; what jumps may be named beside it (it is there in half of the rows), and so may `jump`.
 
-    A constant error of frame, tool or one joint of a parallel machine is also one of its geometry.
+    A constant error of frame, tool or one joint of a parallel machine is also one of its geometry. What the frame does
+    in time may have its own name.
     """
     names = [effect.name] if rig.machine.name == ARM else [effect.name, "geometry"]
+    names += ["frame_drift"] if effect.name == "frame" else []
     sets = [NAMES_NOTHING, *(frozenset({n}) for n in dict.fromkeys(names))]
     accepted = (*sets, *(s | {"jump"} for s in sets))
     return Truth("outside", (cause,), accepted, True, ("time",))
@@ -86,7 +88,10 @@ def _jump(make: Callable[[Rig], Effect], machines: Sequence[str] = ALL) -> Build
         start = int(rng.integers(rig.rows // 3, 2 * rig.rows // 3))
         effect = make(rig)
         after = _gated(rig, effect, (np.arange(rig.rows) >= start).astype(np.float64))
-        return plain_case(family, rig, after, float(rng.choice(_STRENGTHS)), _jump_truth(rig, family, effect))
+        truth = _jump_truth(rig, family, effect)
+        if effect.name == "frame":
+            truth = Truth("single", ("frame_drift",), (frozenset({"frame_drift"}),))
+        return plain_case(family, rig, after, float(rng.choice(_STRENGTHS)), truth)
 
     return build
 
