@@ -269,7 +269,7 @@ def test_a_python_file_without_a_class_is_told_its_classes(cli: Cli, tmp_path: P
         code, _, err = cli("plan", "--mechanism", file, *out)
         assert code == 2 and err.startswith(sentence)
     code, _, err = cli("plan", "--mechanism", "xyzzy", *out)
-    assert code == 2 and "partial. Otherwise give" in err
+    assert code == 2 and "machine. Otherwise give" in err
 
 
 def test_an_arm_in_the_place_of_a_config_and_many_wrong_keys_are_said_shortly(cli, tmp_path: Path) -> None:
