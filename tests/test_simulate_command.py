@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import torch
 from ccnn_torch.config.keys import list_keys
 from ccnn_torch.effects import EFFECTS, Situation, default_gravity, make_effect, pose_residual, signature
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import load_records, read_table
 from ccnn_torch.simulation.config import SimulateConfig
 from ccnn_torch.simulation.job import simulate_records
@@ -84,18 +85,33 @@ def test_bad_rows_are_few_and_far_out() -> None:
 
 @pytest.mark.parametrize("effect", list(EFFECTS))
 def test_every_effect_can_be_drawn_in_a_plausible_size(effect: str) -> None:
-    mechanism = load_mechanism(str(ARM))
+    mechanism = _seen_by(effect)
     one, two = (simulate_records(mechanism, [f"{effect}:size={size}"], 60, seed=3) for size in (1, 2))
     assert 1e-6 < one.gap < 2e-2
     assert two.gap == pytest.approx(2 * one.gap, rel=0.05)
     secondary = {
-        c.name for c in make_effect(effect).coefficients(_situation(one.joints, one.covariates)) if c.secondary
+        c.name
+        for c in make_effect(effect).coefficients(_situation(mechanism, one.joints, one.covariates))
+        if c.secondary
     }
     assert one.injected[0].parameters and not secondary & set(one.injected[0].parameters)
 
 
-def _situation(joints: torch.Tensor, covariates: dict[str, torch.Tensor]) -> Situation:
-    mechanism = load_mechanism(str(ARM))
+def _seen_by(effect: str) -> Mechanism:
+    """The arm, or a mount of two axes for the one effect that is of directions."""
+    if effect != "flexure":
+        return load_mechanism(str(ARM))
+    links = [[0.0, math.pi / 2, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]
+    return load_mechanism("serial", name="mount", convention="standard", links=links, orientation="direction")
+
+
+def test_directions_are_unit_vectors_with_noise_too() -> None:
+    made = simulate_records(_seen_by("flexure"), ["flexure"], 20, {"x": 1e-4, "y": 1e-4, "z": 1e-4}, seed=1)
+    length = made.pose.norm(dim=-1)
+    torch.testing.assert_close(length, length[:1].expand(20), rtol=1e-12, atol=0)
+
+
+def _situation(mechanism: Mechanism, joints: torch.Tensor, covariates: dict[str, torch.Tensor]) -> Situation:
     return Situation(mechanism, joints, covariates, default_gravity(mechanism))
 
 

@@ -16,7 +16,7 @@ from ccnn_torch.effects import OUTLIER, Acting, Situation, default_gravity, meas
 from ccnn_torch.effects.covariates import covariate_units, directions, draw_covariates
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import make_folder
-from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism, sees_directions
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records import name_lines, write_table
 from ccnn_torch.report.table import Table
@@ -234,7 +234,11 @@ def simulate_records(
             injected.append(next(alone))
     pose = measured_pose(situation, frame)
     errors = sigma * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
+    length = pose.norm(dim=-1, keepdim=True)
     pose = _moved(pose, errors) if machine.orientations and pose.shape[-1] == 6 else pose + errors
+    if sees_directions(machine):
+        # A direction has no length that could be measured.
+        pose = pose * length / pose.norm(dim=-1, keepdim=True)
     kept = dict(situation.covariates)
     return Simulated(machine, joints, pose, kept, tuple(injected), tuple(sorted(outliers)), gap)
 

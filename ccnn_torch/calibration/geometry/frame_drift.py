@@ -33,7 +33,8 @@ def without_frame_drift(
     """
     others, drift = verdict.of_machine()
     # Frames by group of rows are refused beside effects.
-    if drift is None or getattr(mechanism, "frame_per", ()) or getattr(mechanism, "tool_per", ()):
+    grouped = any(getattr(mechanism, key, ()) for key in ("frame_per", "tool_per"))
+    if drift is None or grouped:
         return records, verdict, []
     recorded = situation_of(records, mechanism)
     situation = in_time(on_fitted_frames(recorded), moments(records))

@@ -69,7 +69,7 @@ class Tripod(Mechanism):
         slope3 = -z / torch.sqrt(l3**2 - z**2)
         rho3 = [torch.ones_like(slope3), slope3, torch.zeros_like(slope3)]
         rows: Tensor = stack_last(*rho1, *rho2, *rho3)
-        return rows.reshape(*pose.shape[:-1], 3, 3)
+        return rows.reshape(*rows.shape[:-1], 3, 3)
 
     def _legs(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Length, radius and offset of each leg, `... x 3` [m]."""
