@@ -234,11 +234,10 @@ def simulate_records(
             injected.append(next(alone))
     pose = measured_pose(situation, frame)
     errors = sigma * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
-    length = pose.norm(dim=-1, keepdim=True)
     pose = _moved(pose, errors) if machine.orientations and pose.shape[-1] == 6 else pose + errors
     if sees_directions(machine):
         # A direction has no length that could be measured.
-        pose = pose * length / pose.norm(dim=-1, keepdim=True)
+        pose = pose * (situation.pose.norm(dim=-1) / pose.norm(dim=-1))[:, None]
     kept = dict(situation.covariates)
     return Simulated(machine, joints, pose, kept, tuple(injected), tuple(sorted(outliers)), gap)
 
