@@ -121,6 +121,31 @@ def compose(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tupl
     return rotation @ second[0], translation + (rotation @ second[1][..., None])[..., 0]
 
 
+def _links_and_drives(
+    convention: str, links: Sequence[Sequence[float]], joint_units: Sequence[str], drives: Sequence[Sequence[int]]
+) -> list[Parameter]:
+    """Parameters of the links, then of the drives."""
+    _, names, units, _ = LINKS[convention]
+    found = []
+    for i, row in enumerate(links):
+        found += [Parameter(f"{p}{i + 1}", u, v) for p, u, v in zip(names, units, row, strict=True)]
+    for i, j in drives:
+        to, by = joint_units[i - 1], joint_units[j - 1]
+        found.append(Parameter(f"drive{i}{j}", "1" if to == by else f"{to}/{by}", 0.0, scale=_DRIVE))
+    return found
+
+
+def _counting(convention: str, count: int, directions: bool) -> Tensor:
+    """Which of the parameters of each link count, `n x k`: to directions of lengths those behind the last axis."""
+    _, names, units, _ = LINKS[convention]
+    found = torch.ones(count, len(names), dtype=torch.float64)
+    if directions:
+        behind = {"standard": ("a", "d"), "modified": ("d",), "urdf": ()}[convention]
+        found[:, [k for k, unit in enumerate(units) if unit == "m"]] = 0.0
+        found[-1, [k for k, p in enumerate(names) if p in behind]] = 1.0
+    return found
+
+
 def _start_and_shares(own: Sequence[Parameter], numbers: Sequence[Mapping[str, Any]]) -> tuple[Tensor, Tensor]:
     """Parameters `l` without the numbers [SI], and what one unit of each number adds to them, `k x l`."""
     names = [p.name for p in own]
@@ -229,17 +254,12 @@ class SerialArm(Mechanism):
             unknown = unknown - {"tool"} | ({"tool"} if isinstance(tool_offset, str) else set())
         n = len(links)
         types = tuple(joint_types or ["revolute"] * n)
-        self._transform, names, units, self._axis_before = LINKS[convention]
+        self._transform, _, _, self._axis_before = LINKS[convention]
         pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
         shown = {c for c, _ in pose}
         geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(FRAME, base, strict=True)]
-        own = []
-        for i, row in enumerate(links):
-            own += [Parameter(f"{p}{i + 1}", u, v) for p, u, v in zip(names, units, row, strict=True)]
         joint_units = ["rad" if t == "revolute" else "m" for t in types]
-        for i, j in drives:
-            to, by = joint_units[i - 1], joint_units[j - 1]
-            own.append(Parameter(f"drive{i}{j}", "1" if to == by else f"{to}/{by}", 0.0, scale=_DRIVE))
+        own = _links_and_drives(convention, links, joint_units, drives)
         if orientation == "direction" and n == len(MOUNT):
             named = {f"{p}{i}": sense for i, senses in enumerate(MOUNT, 1) for p, sense in senses.items()}
             own = [replace(p, sense=named.get(p.name, "")) for p in own]
@@ -274,13 +294,7 @@ class SerialArm(Mechanism):
         self.drives, self._named, self._links_size = tuple(map(tuple, drives)), bool(numbers), count - len(drives)
         self.register_buffer("_start", start, persistent=False)
         self.register_buffer("_shares", shares, persistent=False)
-        # Which of the parameters of each link count, `n x k`.
-        counting = torch.ones(n, len(names), dtype=torch.float64)
-        if orientation == "direction":
-            behind = {"standard": ("a", "d"), "modified": ("d",), "urdf": ()}[convention]
-            counting[:, [k for k, unit in enumerate(units) if unit == "m"]] = 0.0
-            counting[-1, [k for k, p in enumerate(names) if p in behind]] = 1.0
-        self.register_buffer("counting", counting)
+        self.register_buffer("counting", _counting(convention, n, orientation == "direction"))
         self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
         self._follow_nominal()
 
