@@ -27,10 +27,14 @@ from ccnn_torch import diagnose
 from ccnn_torch.api import identify
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.compensation import load_compensation
 from ccnn_torch.compensation.model_files.identified import load_machine
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Instrument, load_mechanism, mechanism_from_description
+from ccnn_torch.planning.config import PlanConfig
+from ccnn_torch.planning.job import make_plan
 from ccnn_torch.records import load_records
+from ccnn_torch.verification.job import verify_model
 
 CAMERA: dict[str, Any] = {"kind": "camera", "fx": 900.0, "cx": 640.0, "cy": 360.0}
 ANCHORS = np.array([[1.2, 0.3, 0.1], [-0.8, 1.1, 0.4], [0.2, -1.3, 0.9]])
@@ -289,3 +293,28 @@ def test_a_gauge_reads_heights_over_its_plane() -> None:
     place = arm.forward_kinematics(q)
     expected = [float(place[0, 2]) - 0.1, float(place[1, 0]) - 0.2]
     np.testing.assert_allclose(machine.forward_kinematics(q, values, guess)[:, 0].numpy(), expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("keys", [{"kind": "level"}, {"kind": "wire", "anchors": 2}])
+def test_poses_are_planned_for_an_instrument(tmp_path: Path, keys: dict[str, Any]) -> None:
+    machine = load_mechanism("instrument", mechanism=str(arm_file(tmp_path, frames=False)), **keys)
+    _, plans = make_plan(machine, 24, PlanConfig.from_file(None, ["candidates=60"]))
+    assert plans[0].joints.shape == (24, 6) and len(torch.unique(plans[0].joints, dim=0)) == 24
+    assert bool(torch.isfinite(plans[0].pose).all())
+
+
+def test_a_model_is_verified_by_the_pixels_of_another_day(tmp_path: Path) -> None:
+    """The lens that was found goes with the new rows: the model is of the arm."""
+    keys = _camera(tmp_path)
+    found = identify(**keys, noise="0.2 px", seed=0)
+    found.save(tmp_path / "found")
+    later = write(tmp_path / "later.csv", *images(Arm(0), 6, 50, 0.2))
+    machine = found.mechanism()
+    assert isinstance(machine, Instrument)
+    values = {p.name: v for p, v in zip(machine.geometry, machine.nominal.tolist(), strict=True)}
+    lens = {name: values[f"camera_{name}"] / PIXEL for name in ("fx", "fy", "cx", "cy")}
+    lens |= {name: values[f"camera_{name}"] for name in ("k1", "k2")}
+    model = load_compensation(tmp_path / "found" / "identified.yaml")
+    about = {"mechanism": keys["mechanism_keys"]["mechanism"], "kind": "camera", **lens}
+    said = verify_model(model, str(later), "instrument", mechanism_keys=about).results
+    assert said.position.after.rms < 2.5 * math.sqrt(2) * 0.2 * PIXEL < 0.2 * said.position.before.rms

@@ -15,7 +15,7 @@ from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative, nearest
 from ccnn_torch.mechanisms.pose import Frame, frame_gap
-from ccnn_torch.numerics.batching import expand_leading
+from ccnn_torch.numerics.batching import expand_leading, leading_shape
 
 _ROTATION_WEIGHT = 0.04
 
@@ -121,7 +121,7 @@ class Seen(Around):
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """All that is finite: what is not seen may be anything; `...`, bool."""
-        return torch.isfinite(pose).all(-1)
+        return torch.isfinite(pose).all(-1).expand(leading_shape(pose, self.resolve(parameters)))
 
     def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
         """As of the mechanism, in the pose of the joints."""

@@ -12,6 +12,7 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.machines.serial import FRAME, SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
 _BASE = 6
@@ -77,7 +78,7 @@ class Pair(Mechanism):
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """All that is finite: arms that reach each other anywhere do so in many ways; `...`, bool."""
-        return torch.isfinite(pose).all(-1)
+        return torch.isfinite(pose).all(-1).expand(leading_shape(pose, self.resolve(parameters)))
 
     def forward_kinematics(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
