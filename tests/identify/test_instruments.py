@@ -261,6 +261,7 @@ def test_what_no_instrument_can_be_is_refused(tmp_path: Path) -> None:
         ({"kind": "wire", "anchors": 0}, "anchors: 0 is no number of them"),
         ({"kind": "encoder", "joint": "q9"}, "there is no joint 'q9'; write one of q1, q2"),
         ({"kind": "level", "link": 9}, "link: 9 is no link of own; write 0 to 6"),
+        ({"kind": "wire", "link": 2}, "only a level may be on one"),
         ({"kind": "camera", "fx": 900.0}, "camera: .*missing.*cx"),
         ({"kind": "dial", "normals": [[0, 0, 0]]}, "normals: write a direction"),
     ):

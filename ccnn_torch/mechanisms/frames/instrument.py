@@ -51,6 +51,8 @@ class Instrument(Seen):
                 f"write 0 to {links}" if isinstance(mechanism, SerialArm) else "only a serial arm has links; remove it"
             )
             raise InputError(f"link: {link} is no link of {mechanism.name}; {what}")
+        if link is not None and not reading.on_links:
+            raise InputError(f"link: how a {reading.kind} sits on a link has no parameters; only a level may be on one")
         at_home = place_of(mechanism, link, mechanism.home_joints, mechanism.nominal)
         if reading.turns and at_home.rotation is None:
             raise InputError(f"mechanism '{mechanism.name}' has no orientation, which a {reading.kind} on it needs")

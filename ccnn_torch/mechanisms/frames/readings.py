@@ -41,6 +41,7 @@ class Reading:
         kind: its name in `READINGS`.
         keys: from which it was made.
         turns: whether it needs the orientation of what holds it.
+        on_links: whether its parameters say how it sits on a link.
         read: what it reads; all lengths or all angles, three at most.
         given: what it was pointed at, columns of the records.
         usual: of what is given, where no row says it [SI].
@@ -52,6 +53,7 @@ class Reading:
     kind = ""
     note = ""
     turns = False
+    on_links = False
     keys: dict[str, Any]
     read: tuple[Coordinate, ...]
     given: tuple[Coordinate, ...] = ()
@@ -226,6 +228,7 @@ class Level(Reading):
 
     kind = "level"
     turns = True
+    on_links = True
     read = (Coordinate("tilt_x", "rad"), Coordinate("tilt_y", "rad"))
     unknown = ("level",)
 
