@@ -16,7 +16,8 @@ from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text, read_xml
 from ccnn_torch.files.yaml_file import parse_yaml
-from ccnn_torch.mechanisms.machines.serial import MOST_JOINTS, SerialArm, compose
+from ccnn_torch.mechanisms.machines.links import compose
+from ccnn_torch.mechanisms.machines.serial import MOST_JOINTS, SerialArm
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
 from ccnn_torch.units import LARGEST
 

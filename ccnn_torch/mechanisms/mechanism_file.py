@@ -25,7 +25,8 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
-from ccnn_torch.mechanisms.machines.serial import SerialArm, compose
+from ccnn_torch.mechanisms.machines.links import compose
+from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.units import LARGEST

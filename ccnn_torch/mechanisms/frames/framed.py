@@ -11,7 +11,8 @@ from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.around import Around
 from ccnn_torch.mechanisms.frames.fit import best_closed_form, rigid_body_frame
-from ccnn_torch.mechanisms.machines.serial import FRAME, compose
+from ccnn_torch.mechanisms.machines.links import compose
+from ccnn_torch.mechanisms.machines.serial import FRAME
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative
 from ccnn_torch.mechanisms.pose import Frame, frame_gap

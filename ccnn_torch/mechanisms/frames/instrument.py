@@ -15,7 +15,8 @@ from ccnn_torch.mechanisms.frames.fit import fit_frames
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.frames.partial import Seen
 from ccnn_torch.mechanisms.frames.readings import Place, Reading, make_reading
-from ccnn_torch.mechanisms.machines.serial import SerialArm, compose
+from ccnn_torch.mechanisms.machines.links import compose
+from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.pose import Frame
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt

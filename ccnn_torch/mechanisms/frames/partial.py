@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +21,7 @@ from ccnn_torch.numerics.batching import expand_leading, leading_shape
 _ROTATION_WEIGHT = 0.04
 
 
-class Seen(Around):
+class Seen(Around, ABC):
     """A mechanism as something shows it: its pose is what is read, which may be less than the mechanism's whole pose.
 
     Joints are the mechanism's, parameters too, with those of what reads it behind them. Where joints are more than
@@ -61,9 +62,9 @@ class Seen(Around):
         """A whole pose of the mechanism inside near one that shows this, `... x p'` [SI]; None where nothing says."""
         return None
 
+    @abstractmethod
     def around(self, mechanism: Mechanism) -> Seen:
         """Another mechanism seen in the same way."""
-        raise NotImplementedError
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 6` or `x 3`."""

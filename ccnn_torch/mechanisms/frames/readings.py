@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -34,7 +35,7 @@ class Place(NamedTuple):
     joints: Tensor
 
 
-class Reading:
+class Reading(ABC):
     """An instrument.
 
     Attributes:
@@ -61,9 +62,9 @@ class Reading:
     parameters: tuple[Parameter, ...]
     unknown: tuple[str, ...]
 
+    @abstractmethod
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
         """What it reads, `... x c` [SI]; own `... x m`, given `... x g`."""
-        raise NotImplementedError
 
     def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
         """Its parameters near those that suit rows `s x (c + g)`, from the nominal ones, `m` [SI]."""

@@ -1,0 +1,132 @@
+"""Conventions of a serial arm's links: their parameters, transforms, and what each parameter moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import Parameter
+from ccnn_torch.numerics.batching import stack_last
+from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, rotation_vector_to_matrix
+
+# Plausible share by which a drive moves another joint, or its own too far: that of a gear or a scale.
+_DRIVE = 1e-3
+LinkTransform = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+def _standard(links: Tensor, turn: Tensor, slide: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """Rz(q + theta) Tz(d) Tx(a) Rx(alpha) (Denavit and Hartenberg 1955); links `... x n x 4` = a, alpha, d, theta."""
+    a, alpha, d, theta = links.unbind(-1)
+    s, c, sa, ca = torch.sin(turn + theta), torch.cos(turn + theta), torch.sin(alpha), torch.cos(alpha)
+    zero = torch.zeros_like(s)
+    rotation = stack_last(c, -s * ca, s * sa, s, c * ca, -c * sa, zero, sa, ca)
+    return rotation.reshape(*rotation.shape[:-1], 3, 3), stack_last(a * c, a * s, d + slide)
+
+
+def _modified(links: Tensor, turn: Tensor, slide: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """Rx(alpha) Tx(a) Rz(q + theta) Tz(d) (Craig 1986); links `... x n x 4` = a, alpha, d, theta."""
+    a, alpha, d, theta = links.unbind(-1)
+    s, c, sa, ca = torch.sin(turn + theta), torch.cos(turn + theta), torch.sin(alpha), torch.cos(alpha)
+    zero = torch.zeros_like(s)
+    rotation = stack_last(c, -s, zero, s * ca, c * ca, -sa, s * sa, c * sa, ca)
+    return rotation.reshape(*rotation.shape[:-1], 3, 3), stack_last(a, -sa * (d + slide), ca * (d + slide))
+
+
+def _origin(links: Tensor, turn: Tensor, slide: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """URDF: a fixed origin, then the motion about or along an axis; links `... x n x 6` = x, y, z, roll, pitch, yaw."""
+    fixed = euler_zyx_to_matrix(links[..., 3:].flip(-1))
+    motion = rotation_vector_to_matrix(axes * turn[..., None])
+    slid = (fixed @ (axes * slide[..., None])[..., None])[..., 0]
+    return fixed @ motion, links[..., :3] + slid
+
+
+Screws = tuple[Tensor, Tensor]
+Frames = tuple[Tensor, Tensor]
+
+
+def _standard_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) -> Screws:
+    """Of theta and d about and along z of the frame before, of a and alpha along and about x of the frame after."""
+    z, x = before[0][..., 2], after[0][..., 0]
+    parts = [_shift(x), _turn(x, after[1], tip), _shift(z), _turn(z, before[1], tip)]
+    return torch.stack([p[0] for p in parts], -2), torch.stack([p[1] for p in parts], -2)
+
+
+def _modified_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) -> Screws:
+    """Of alpha and a about and along x of the frame before, of theta and d about and along z of the frame after."""
+    x, z = before[0][..., 0], after[0][..., 2]
+    parts = [_shift(x), _turn(x, before[1], tip), _shift(z), _turn(z, after[1], tip)]
+    return torch.stack([p[0] for p in parts], -2), torch.stack([p[1] for p in parts], -2)
+
+
+def _origin_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) -> Screws:
+    """Of x, y, z along the axes of the frame before, of roll, pitch and yaw about the origin that they lead to."""
+    rotation, place = before
+    origin = place + (rotation @ links[..., :3, None])[..., 0]
+    pitch, yaw = links[..., 4:].unbind(-1)
+    s, c, sp, cp = torch.sin(yaw), torch.cos(yaw), torch.sin(pitch), torch.cos(pitch)
+    zero, one = torch.zeros_like(s), torch.ones_like(s)
+    local = stack_last(c * cp, s * cp, -sp, -s, c, zero, zero, zero, one).reshape(*s.shape, 3, 3)
+    axes = (rotation @ local.mT).mT
+    slides = rotation.mT.expand(*axes.shape)
+    lever = (tip - origin)[..., None, :].expand(axes.shape)
+    turns = torch.linalg.cross(axes, lever, dim=-1)
+    return torch.cat([slides, turns], -2), torch.cat([torch.zeros_like(axes), axes], -2)
+
+
+def _shift(axis: Tensor) -> Screws:
+    return axis, torch.zeros_like(axis)
+
+
+def _turn(axis: Tensor, place: Tensor, tip: Tensor) -> Screws:
+    return torch.linalg.cross(axis, tip - place, dim=-1), axis
+
+
+SCREWS: dict[str, Callable[[Tensor, Frames, Frames, Tensor], Screws]] = {
+    "standard": _standard_screws,
+    "modified": _modified_screws,
+    "urdf": _origin_screws,
+}
+"""Convention -> velocity of a tip `... x n x 3` and rate of rotation by each parameter of each link, `... x n x k x 3`
+each, in the arm's base: from links `... x n x k`, the frames before and after each (rotation `... x n x 3 x 3`, place
+`... x n x 3`) and the tip."""
+
+# Transform, parameter names of a link, their units, and whether the joint axis is fixed in the frame before the link
+# (standard DH: z of frame i - 1) or in the one behind it.
+LINKS: dict[str, tuple[LinkTransform, tuple[str, ...], tuple[str, ...], bool]] = {
+    "standard": (_standard, ("a", "alpha", "d", "theta"), ("m", "rad", "m", "rad"), True),
+    "modified": (_modified, ("a", "alpha", "d", "theta"), ("m", "rad", "m", "rad"), False),
+    "urdf": (_origin, ("x", "y", "z", "roll", "pitch", "yaw"), ("m", "m", "m", "rad", "rad", "rad"), False),
+}
+
+
+def compose(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Product of two transforms, each (rotation `... x 3 x 3`, translation `... x 3`)."""
+    rotation, translation = first
+    return rotation @ second[0], translation + (rotation @ second[1][..., None])[..., 0]
+
+
+def links_and_drives(
+    convention: str, links: Sequence[Sequence[float]], joint_units: Sequence[str], drives: Sequence[Sequence[int]]
+) -> list[Parameter]:
+    """Parameters of the links, then of the drives."""
+    _, names, units, _ = LINKS[convention]
+    found = []
+    for i, row in enumerate(links):
+        found += [Parameter(f"{p}{i + 1}", u, v) for p, u, v in zip(names, units, row, strict=True)]
+    for i, j in drives:
+        to, by = joint_units[i - 1], joint_units[j - 1]
+        found.append(Parameter(f"drive{i}{j}", "1" if to == by else f"{to}/{by}", 0.0, scale=_DRIVE))
+    return found
+
+
+def counting(convention: str, count: int, directions: bool) -> Tensor:
+    """Which of the parameters of each link count, `n x k`: to directions of lengths those behind the last axis."""
+    _, names, units, _ = LINKS[convention]
+    found = torch.ones(count, len(names), dtype=torch.float64)
+    if directions:
+        behind = {"standard": ("a", "d"), "modified": ("d",), "urdf": ()}[convention]
+        found[:, [k for k, unit in enumerate(units) if unit == "m"]] = 0.0
+        found[-1, [k for k, p in enumerate(names) if p in behind]] = 1.0
+    return found
