@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from arm_text import arm_text
 from numpy.typing import NDArray
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
@@ -95,22 +96,8 @@ def test_distances_between_commanded_places(tmp_path: Path, cli: Cli, monkeypatc
     np.testing.assert_allclose(found[0], found[1], atol=1e-9)
 
 
-ARM = """
-robot: small arm
-dof: 6
-units: {length: m, angle: rad}
-convention: standard Denavit-Hartenberg
-a: [0, -0.612, -0.5723, 0, 0, 0]
-alpha: [1.5707963267948966, 0, 0, 1.5707963267948966, -1.5707963267948966, 0]
-d: [0.1273, 0, 0, 0.163941, 0.1157, 0.0922]
-theta: [0, 0, 0, 0, 0, 0]
-base_frame: unknown
-tool_frame: {tool}
-"""
-
-
 def arm(tmp_path: Path, tool: str = "unknown") -> SerialArm:
-    (tmp_path / "arm.yaml").write_text(ARM.replace("{tool}", tool))
+    (tmp_path / "arm.yaml").write_text(arm_text(f"base_frame: unknown\ntool_frame: {tool}\n"))
     machine = load_mechanism(str(tmp_path / "arm.yaml"))
     assert isinstance(machine, SerialArm)
     return machine

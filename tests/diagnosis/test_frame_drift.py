@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from arm_text import ALPHA, A, D, arm_text
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -23,18 +24,7 @@ from ccnn_torch.simulation.job import simulate_records
 
 Array = NDArray[np.float64]
 Cli = Callable[..., tuple[int, str, str]]
-A, D = [0, -0.6, -0.55, 0, 0, 0], [0.13, 0, 0, 0.11, 0.11, 0.1]
-ALPHA = [np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]
-ARM = f"""dof: 6
-convention: standard Denavit-Hartenberg
-units: {{length: m, angle: rad}}
-a: {A}
-alpha: {ALPHA}
-d: {D}
-theta: [0, 0, 0, 0, 0, 0]
-base_frame: unknown
-tool_frame: unknown
-"""
+ARM = arm_text()
 NOISE, TURN_NOISE = 2e-5, 3e-5
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from arm_text import ALPHA, A, D, arm_text
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -17,18 +18,7 @@ from ccnn_torch.mechanisms import SerialArm, load_mechanism
 
 Array = NDArray[np.float64]
 Cli = Callable[..., tuple[int, str, str]]
-A, D = [0, -0.6, -0.55, 0, 0, 0], [0.13, 0, 0, 0.11, 0.11, 0.1]
-ALPHA = [np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]
-ARM = f"""dof: 6
-convention: standard Denavit-Hartenberg
-units: {{length: m, angle: rad}}
-a: {A}
-alpha: {ALPHA}
-d: {D}
-theta: [0, 0, 0, 0, 0, 0]
-base_frame: unknown
-tool_frame: unknown
-"""
+ARM = arm_text()
 STATIONS = [[1.5, -2, 0.4, 0.1, -0.05, 0.7], [-3.2, 3.8, 0.3, -0.1, 0.2, -2.0]]
 TOOLS = [[0.02, 0.03, 0.12, 0.1, 0, 0.2], [-0.05, 0.01, 0.3, 0, 0.3, 0]]
 NOISE, TURN_NOISE = 2e-5, 3e-5
