@@ -214,7 +214,7 @@ def diagnose(
     (seconds; --no-network omits that). The folder gets diagnosis.json, report.html and next_measurements.csv, the most
     informative poses to measure next. With --motion it is of time series: delay, gains, friction, play,
     weights, limits. Keys: records, motion, columns, mechanism, out, mechanism_keys, covariates, noise,
-    effects, gravity, network, seed.
+    exact, known, effects, gravity, network, seed.
 
     Examples:
 
@@ -227,6 +227,8 @@ def diagnose(
     ccnn diagnose --records measured.csv --mechanism my_simulator.py:PRESS --out runs/press
 
     ccnn diagnose --motion sine.csv --motion steps.csv --mechanism servo --out runs/axis
+
+    ccnn diagnose --motion sine.csv --mechanism servo --out runs/axis exact=gain,time 'known={mass: 2 %}'
     """
     with loading():
         from ccnn_torch.diagnosis.job import run_diagnosis
@@ -235,6 +237,8 @@ def diagnose(
     logs = [str(log) for log in motion or []] or None
     given = {"records": records, "mechanism": mechanism, "seed": seed, "out": out, "network": network, "motion": logs}
     wanted = _diagnose_config(overrides, config, noise, effects, quiet, **given)
+    if not wanted.motion and (wanted.exact or wanted.known):
+        raise InputError("exact and known: tell how well the values of a motion's model are known; give --motion")
     (run_motion if wanted.motion else run_diagnosis)(wanted, quiet, details)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from ccnn_torch.config.sizes import Noise, size
+from ccnn_torch.config.sizes import Noise, Size, size
 from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap, Names
 from ccnn_torch.errors import InputError
 from ccnn_torch.run_folder.folder import check_own_folder
@@ -61,6 +61,15 @@ class DiagnoseConfig(JobConfig):
         description="standard deviation of the measured pose, in SI or with a unit (10um), one size for every "
         "coordinate or by coordinate or unit; null = estimated from the records; one number is metres for lengths and "
         "radians for angles alike",
+    )
+    exact: Names | None = Field(
+        default=None,
+        description="of a motion: values of the model that are exact, e.g. gain, inertia, and time for the time stamps",
+    )
+    known: dict[str, Size] = Field(
+        default={},
+        description="of a motion: shares to which others are known (standard deviation), e.g. {mass: 2 %}; 3 % each "
+        "where nothing is said, time stamps to 10 % of a sampling step",
     )
     effects: Names | None = Field(
         default=None, description="candidates, by name or path/to/file.py:Name, all for the library; null = all"

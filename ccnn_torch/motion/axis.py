@@ -40,6 +40,8 @@ class Drive(NamedTuple):
         supply: supply voltage over the nominal one, less 1, `b x s`; None = 0.
         warm: temperature less that of the coldest sample, `b x s` [K]; None = 0.
         torque: what else resists the motor, over the nominal gain, `b x s` [rad or m].
+        bent: share of a parabola by which commands leave the straight line between samples, `b`: 0 where every sample
+            is there, nearly 1 of those that were thinned; None = 0.
     """
 
     time: Tensor
@@ -48,6 +50,7 @@ class Drive(NamedTuple):
     supply: Tensor | None = None
     warm: Tensor | None = None
     torque: Tensor | None = None
+    bent: Tensor | None = None
 
 
 def delayed(time: Tensor, values: Tensor, delay: Tensor) -> Tensor:
@@ -126,6 +129,7 @@ def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[
     if np.any(a["supply"]) and drive.supply is not None and bool((drive.supply != 0).any()):
         share = np.maximum(1 + a["supply"] * drive.supply.numpy().T[:, None], 0)
     warm = drive.warm.numpy().T if np.any(a["thermal"]) and drive.warm is not None else None
+    bend = None if drive.bent is None else _bend(u) * drive.bent.numpy()
     found = np.empty_like(u)
     found[0] = q
     ahead = (1 - GAMMA) / GAMMA
@@ -136,12 +140,25 @@ def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[
         slope = (u[k + 1] - u[k]) / parts
         for i in range(parts):
             before = u[k] + i * slope
-            against = (None, None) if push is None else tuple(_between(push, k, (i + c) / parts) for c in (GAMMA, 1.0))
-            middle = rule.step(state, before + GAMMA * slope, fixed, against[0])
+            ends = [(i + c) / parts for c in (GAMMA, 1.0)]
+            against = [None if push is None else _between(push, k, end) for end in ends]
+            asked = [before + c * slope for c in (GAMMA, 1.0)]
+            if bend is not None:
+                asked = [one + end * (1 - end) * bend[k] for one, end in zip(asked, ends, strict=True)]
+            middle = rule.step(state, asked[0], fixed, against[0])
             between = tuple(one + ahead * (other - one) for one, other in zip(state, middle, strict=True))
-            state = rule.step(between, before + slope, fixed, against[1])
+            state = rule.step(between, asked[1], fixed, against[1])
         found[k + 1] = rule.read(state)
     return found
+
+
+def _bend(u: Array) -> Array:
+    """Of each step four times what a parabola through the samples is above the middle of a straight line; 0 at a jump
+    or corner, `(s - 1) x p x b`."""
+    second = np.diff(u, 2, axis=0)
+    second = np.concatenate([second[:1], second, second[-1:]]) if len(second) else np.zeros_like(u)
+    a, b = second[:-1], second[1:]
+    return np.asarray(-0.5 * np.where(a * b > 0, np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0.0))
 
 
 def _between(values: Array, k: int, share: float) -> Array:

@@ -23,6 +23,7 @@ from ccnn_torch.motion.effects.bodies import STANDARD_GRAVITY
 from ccnn_torch.motion.fit import ALONE, deviations
 from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes
+from ccnn_torch.motion.known import TIME, allowed_text, share_of
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.linearised import searched
 from ccnn_torch.motion.log import Log
@@ -186,10 +187,12 @@ def _effects_of(
 
 def _hidden_of(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
     """Cautions where nothing is named although a set leaves clearly less, a sentence each without a full stop."""
-    names = problem.library.names
+    names, shares = problem.library.names, {**problem.unsure, TIME: share_of(problem.known, TIME)}
+    allowed = allowed_text(shares)
     return [
         f"q{i + 1} errs by more than the noise, most like {words_of(names[v.hidden]).cause}, but by less than the form "
-        "of a model and time stamps are known to: record motions that show it more"
+        f"of a model{f' and its values ({allowed})' * bool(allowed)} are known to: say with exact=… what is exact, or "
+        "record motions that show it more"
         for i, v in enumerate(verdicts)
         if v.hidden is not None
     ]

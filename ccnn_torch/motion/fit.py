@@ -267,6 +267,9 @@ def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: 
         least: the variance of each axis is at least that.
     """
     theta = torch.zeros(len(best), problem.library.size, dtype=torch.float64)
+    # Of a model each of whose values was told how well it is known, that is all that it may be off by.
+    is_told = problem.unsure and problem.unsure.keys() <= problem.known.keys()
+    nominal = 0.0 if is_told else _OF_NOMINAL
     command, names = problem.data.command, problem.library.names
     does, most = (
         problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
@@ -276,7 +279,7 @@ def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: 
     for i, fit in enumerate(best):
         shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in fit.members]
         energy = fit_sets(fit.grams, [fit.spec.groups], 0.0).energy[0].tolist()[: len(shares)]
-        form = form_variance([*shares, _OF_NOMINAL], [*energy, does[i]], max(most[i], does[i]))
+        form = form_variance([*shares, nominal], [*energy, does[i]], max(most[i], does[i]))
         found.append(max(form, least[i]))
     return found
 

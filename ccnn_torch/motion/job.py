@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from ccnn_torch.config.sizes import size
@@ -13,6 +14,7 @@ from ccnn_torch.diagnosis.verdict.text import in_doubt
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
 from ccnn_torch.motion.identified import IDENTIFIED, write_identified
+from ccnn_torch.motion.known import shares_of
 from ccnn_torch.motion.log import load_logs
 from ccnn_torch.motion.setting import nominal_of
 from ccnn_torch.motion.stretches import phases_of
@@ -42,6 +44,7 @@ def diagnosed(config: DiagnoseConfig) -> MotionDiagnosis:
         raise InputError("records and motion: a diagnosis is of poses or of a motion; give --records or --motion")
     logs = load_logs([config.motion] if isinstance(config.motion, str) else config.motion, config.columns)
     nominal = nominal_of(config.mechanism, config.mechanism_keys, logs[0].units)
+    nominal = replace(nominal, known=shares_of(config.exact or (), config.known))
     if isinstance(config.noise, dict):
         raise InputError("noise: of a motion must be one standard deviation of the position, such as 1e-3 or 0.1mrad")
     noise = None if config.noise is None else size(config.noise, None, "noise")

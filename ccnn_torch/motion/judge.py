@@ -62,7 +62,8 @@ class AxisVerdict(NamedTuple):
         classes: of each member the effects that can stand in its place.
         driver: what the residual follows outside the library; None where nothing is needed.
         hidden: where nothing is named since models and time stamps are known no better, the effect that explains most;
-            None where what is left is no more than what the best set leaves.
+            None where nothing leaves no more than what the best set leaves.
+        doubted: whether some of that is more than what values and time stamps may be off by.
     """
 
     best: Fit
@@ -71,6 +72,7 @@ class AxisVerdict(NamedTuple):
     classes: Mapping[int, tuple[int, ...]]
     driver: str | None
     hidden: int | None = None
+    doubted: bool = False
 
 
 def judge_axes(found: Search) -> list[AxisVerdict]:
@@ -79,8 +81,8 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
     verdicts = [_judged(found, i, drivers) for i in range(len(found.found))]
     named = {m for v in verdicts for m in v.best.members}
     # What another joint shows clearly is not hidden.
-    verdicts = [v._replace(hidden=None) if v.hidden in named else v for v in verdicts]
-    return [v if v.hidden is None else v._replace(probability=min(v.probability, _UNCONFIRMED)) for v in verdicts]
+    verdicts = [v._replace(hidden=None, doubted=False) if v.hidden in named else v for v in verdicts]
+    return [v._replace(probability=min(v.probability, _UNCONFIRMED)) if v.doubted else v for v in verdicts]
 
 
 def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
@@ -97,15 +99,17 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
         levels.append((1 / len(LEVELS), named))
     explanations = posterior(levels)
     verdict = judge(explanations, explanations, of_classes=True)
-    best, hidden = by_members[verdict.chosen.best.members], None
+    best, hidden, doubted = by_members[verdict.chosen.best.members], None, False
     probability = verdict.probability
     if verdict.outside and not holds(problem, verdict.chosen.best):
         probability = min(probability, _UNCONFIRMED)
-    if not best.members and not verdict.outside and _after_nuisance(best, fits[0].noise) > _CLEARLY**2 * fits[0].rss:
+    most = _CLEARLY**2 * fits[0].rss
+    if not best.members and not verdict.outside and best.rss > most:
         hidden = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left).members[0]
+        doubted = _after_nuisance(best, fits[0].noise) > most
     marginals = {e: marginal(explanations, e) for e in {e for f in fits for e in f.members}}
     driver = verdict.drivers[0] if verdict.outside else None
-    return AxisVerdict(best, probability, marginals, verdict.classes, driver, hidden)
+    return AxisVerdict(best, probability, marginals, verdict.classes, driver, hidden, doubted)
 
 
 def _after_nuisance(nothing: Fit, noise: float) -> float:
@@ -198,7 +202,7 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     taken: list[dict[Members, float]] = [{} for _ in drivers]
     left = {members: fit.left for members, fit in fits.items()}
     # What a driver has to take away: a smooth function can follow what is wrong with the form of a model.
-    slight = float(problem.stamped[axis][problem.data.judged].square().mean()) * values
+    slight = float((problem.stamped[axis][problem.data.judged] / problem.unit[axis]).square().mean()) * values
     for base in {f.members: f for f in [*found.found[axis][:_BASES], *chain]}.values():
         theta, flat = base.spec.theta, list(base.spec.flat)
         residual, columns = sensitivities(problem, found.whitening, theta[None], mine, [flat])

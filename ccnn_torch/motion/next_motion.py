@@ -164,6 +164,7 @@ def _problem_of(problem: Problem, axis: int, proposed: Sequence[Motion]) -> Prob
         judged=(time > _LEAD)[None],
         run=torch.zeros(1, dtype=torch.int64),
         beside={},
+        bent=None,
     )
     step = float(problem.data.time.diff(dim=-1).median()) * problem.pool
     return replace(
@@ -173,6 +174,7 @@ def _problem_of(problem: Problem, axis: int, proposed: Sequence[Motion]) -> Prob
         followed=command,
         supply=still,
         warm=still,
+        unit=problem.unit[axis].expand(count),
         torque=None,
         carried=None,
         simulated=None,

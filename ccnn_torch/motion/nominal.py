@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,6 +74,7 @@ class Nominal:
         simulator: makes the positions that the axes follow; None where they follow the commands.
         loaded: `time, commands, measured` positions -> as of `Loaded`; None where the axes tell the positions.
         notes: sentences without a full stop.
+        known: as of `Problem`.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Nominal:
     heaviest: float | None = None
     masses: tuple[float, ...] = ()
     loaded: Callable[[Array, Array, Array | None], Loaded] | None = None
+    known: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def own_effects(self) -> list[MotionEffect]:

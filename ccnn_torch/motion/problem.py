@@ -13,21 +13,14 @@ from ccnn_torch.evidence.shrink import FOLDS
 from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.effects.bodies import CARRIED
 from ccnn_torch.motion.effects.registry import OWN
+from ccnn_torch.motion.known import OF, TIME, share_of
 from ccnn_torch.motion.library import Library
+from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.motion.stretches import Stretches
 from ccnn_torch.motion.whiten import Whitening
 
 # Of an axis that ran away: no residual is larger, in units of the motion.
 _FARTHEST = 10.0
-# Share to which the values of a nominal model are known (standard deviation), and those that are.
-_KNOWN = 0.03
-# Share of a sampling step by which the time stamps of commands and positions may differ (standard deviation).
-_STAMP = 0.1
-_WEIGHT = ("gravity_sin", "gravity_cos")
-_UNSURE = (
-    *(*_WEIGHT, "gain", "integral", "derivative", "inertia", "viscous", "coulomb", "load_friction", "stribeck"),
-    *("weakness", "delay"),
-)
 
 
 @dataclass(frozen=True)
@@ -40,8 +33,11 @@ class Problem:
         followed: what the axes follow, `n x b x s`: the commands, or what a simulator makes of them.
         torque, simulated, there: as of `Driven`.
         supply, warm: as of `Drive`, `b x s`.
+        unit: of whitened residuals, about a thousandth of the motion of each axis, so that no least number is one of
+            rad or m; a power of two, which rounds nothing; `n` [rad or m].
         own: what a unit of each of a simulator's own parameters changes in its positions, by name, `n x b x s`.
         parted: whether folds are parts of the runs, where these could be folds.
+        known: shares to which values of the nominal model and time stamps are known, as of `shares_of`.
         carried: what 1 kg at the tool adds to `torque`, `n x b x s` [rad or m per kg].
         pool: so many samples are averaged before they are judged: what is faster than the motion is noise.
     """
@@ -51,6 +47,7 @@ class Problem:
     followed: Tensor
     supply: Tensor
     warm: Tensor
+    unit: Tensor
     pool: int = 1
     torque: Tensor | None = None
     simulated: Tensor | None = None
@@ -58,6 +55,7 @@ class Problem:
     own: Mapping[str, Tensor] = field(default_factory=dict)
     carried: Tensor | None = None
     parted: bool = False
+    known: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def axes(self) -> Tensor:
@@ -115,6 +113,7 @@ class Problem:
         data = self.data._replace(
             time=many(self.data.time),
             position=self.data.position.repeat(1, m, 1),
+            bent=None if self.data.bent is None else self.data.bent.repeat(m),
             speed=self.data.speed.repeat(1, m, 1),
         )
         wide = replace(
@@ -136,17 +135,24 @@ class Problem:
 
         About `theta`, `n x k`, the machine as it seems to be: a model that is wrong may be near to its stability.
         """
-        n, rows, nominal = len(self.followed), torch.arange(len(self.data.time)), self.library.nominal
+        rows, nominal = torch.arange(len(self.data.time)), self.library.nominal
         plain, columns = self._moved(theta, self.axes, rows, self._start), []
-        absent = torch.zeros(n, dtype=torch.float64)
-        weight = torch.hypot(*(nominal.get(name, absent) for name in _WEIGHT))
-        sizes = {"gain": torch.ones_like(absent), **nominal, **dict.fromkeys(_WEIGHT, weight)}
-        for name, size in sizes.items() if nominal else ():
-            if name in _UNSURE and bool((size != 0).any()):
-                before = nominal.get(name, sizes["gain"] if name == "gain" else absent)
-                other = self.library._replace(nominal={**nominal, name: before + _KNOWN * size})
+        absent = torch.zeros(len(self.followed), dtype=torch.float64)
+        for key, share in self.unsure.items():
+            # The direction of a weight is known as well as its size.
+            size = torch.hypot(*(nominal.get(name, absent) for name in OF["mass"])) if key == "mass" else None
+            for name in OF[key]:
+                before = nominal.get(name, absent + ABSENT[name])
+                moved = before + share * (before if size is None else size)
+                other = self.library._replace(nominal={**nominal, name: moved})
                 columns.append(replace(self, library=other)._moved(theta, self.axes, rows, self._start) - plain)
         return torch.stack([*columns, self.stamped])
+
+    @property
+    def unsure(self) -> dict[str, float]:
+        """Shares to which the values that the nominal model has are known, by key."""
+        there = ["gain", *self.library.nominal] if self.library.nominal else []
+        return {key: share_of(self.known, key) for key, own in OF.items() if any(name in there for name in own)}
 
     @property
     def stamped(self) -> Tensor:
@@ -155,7 +161,7 @@ class Problem:
         rows = self.data.log
         there = (rows >= 0)[:, 1:]
         step = self.data.time.diff(dim=-1)[there] / rows.diff(dim=-1)[there]
-        return _STAMP * float(step.median()) * self.data.speed
+        return share_of(self.known, TIME) * float(step.median()) * self.data.speed
 
     def _moved(self, theta: Tensor, axis: Tensor, rows: Tensor, start: Tensor) -> Tensor:
         data, p, b = self.data, len(theta), len(rows)
@@ -179,6 +185,7 @@ class Problem:
             of_all(self.supply),
             of_all(self.warm),
             torque,
+            None if self.data.bent is None else self.data.bent[rows].repeat(p),
         )
         values = {name: value.repeat_interleave(b)[None] for name, value in parameters.items()}
         moved = simulate_axes(drive, values)[0].reshape(p, b, -1)
@@ -225,6 +232,6 @@ class Problem:
         return self.pooled(self.data.judged.double()) == 1
 
     def whitened(self, residual: Tensor, axis: Tensor, whitening: Whitening, chosen: Tensor | None = None) -> Tensor:
-        """Whitened means of residuals `p x b x s` of the axes `p`, `p x (b t)`; 0 where they do not count."""
+        """Whitened means of residuals `p x b x s` of the axes `p` in `unit`, `p x (b t)`; 0 where they do not count."""
         judged = self.judged if chosen is None else self.judged[chosen]
-        return (whitening(self.pooled(residual), axis) * judged).flatten(1)
+        return (whitening(self.pooled(residual), axis) * judged).flatten(1) / self.unit[axis, None]

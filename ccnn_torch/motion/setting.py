@@ -48,8 +48,11 @@ def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEf
     if all(library.lacking):
         need = "; ".join(f"{name} needs {why}" for name, why in zip(library.names, library.lacking, strict=True))
         raise InputError(f"effects: these logs can show none of the candidates: {need}")
+    span = data.position.amax((-1, -2)) - data.position.amin((-1, -2))
+    unit = torch.exp2((1e-3 * span).clamp_min(1e-12).log2().round())
     pool = max(round(_POOLED / float(data.time.diff(dim=-1).median())), 1)
-    return Problem(data, library, pool=pool, supply=supply, warm=warm, **driven._asdict())
+    own = driven._asdict()
+    return Problem(data, library, pool=pool, supply=supply, warm=warm, unit=unit, known=nominal.known, **own)
 
 
 def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Tensor, warm: Tensor) -> Facts:

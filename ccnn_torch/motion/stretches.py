@@ -44,6 +44,7 @@ class Stretches(NamedTuple):
         log: every sample's place in its log, `b x s`, int64.
         units: of the joints.
         notes: what was left out, one sentence each without a full stop.
+        bent: as of `Drive`; None where no log was thinned.
     """
 
     time: Tensor
@@ -56,6 +57,7 @@ class Stretches(NamedTuple):
     log: Tensor
     units: tuple[str, ...]
     notes: tuple[str, ...]
+    bent: Tensor | None = None
 
 
 def cut_stretches(logs: Sequence[Log]) -> Stretches:
@@ -86,7 +88,9 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
     if len(pieces) > _MOST:
         notes.append(f"{_MOST} of {count_text(len(pieces), 'stretch')}, spread evenly over the logs, were evaluated")
         pieces = [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, _MOST).round().astype(int))]
-    return _padded(logs, pieces, notes)
+    # A command is a straight line between the samples of the log, not between those that are left.
+    bent = torch.tensor([1 - strides[number] ** -2 for number, _, _ in pieces], dtype=torch.float64)
+    return _padded(logs, pieces, notes)._replace(bent=bent if max(strides) > 1 else None)
 
 
 def smooth_speed(time: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,8 +9,10 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+import torch
 from frozen import frozen
 from motion.servo import GAIN, INERTIA, KEYS, LENGTH, LOAD, MASS, VISCOUS, command, moved, moved_on_a_spring, write_log
+from scipy.signal import lsim
 
 from ccnn_torch.diagnosis.verdict.findings import findings
 from ccnn_torch.errors import InputError
@@ -21,7 +23,9 @@ from ccnn_torch.motion import (
     nominal_of,
     write_identified,
 )
+from ccnn_torch.motion.effects import motion_effects
 from ccnn_torch.motion.servo import axis_keys
+from ccnn_torch.motion.setting import problem_of
 from ccnn_torch.records import read_table
 
 Cli = Callable[..., tuple[int, str, str]]
@@ -151,7 +155,45 @@ def test_what_is_less_than_models_are_known_to_is_not_said_to_be_noise(tmp_path:
     nominal = nominal_of("servo", KEYS, ["rad"])
     found = diagnose_motion(load_logs([log]), nominal, ["delay", "coulomb"]).content
     assert found["verdict"]["none"] and found["verdict"]["probability"] <= 0.5
-    assert "most like dry friction, but by less than the form of a model and time stamps" in found["cautions"][0]
+    allowed = "(gain 3 %, inertia 3 %, viscous 3 %, time 10 % of a step)"
+    assert (
+        f"most like dry friction, but by less than the form of a model and its values {allowed}" in found["cautions"][0]
+    )
+
+
+def test_of_a_model_whose_values_are_exact_little_friction_is_named(tmp_path: Path, cli: Cli) -> None:
+    log, out = write_log(tmp_path / "log.csv", (0, 1), 2.4, dry=0.0024), tmp_path / "out"
+    given = ("diagnose", "--motion", log, "--mechanism", "servo", "--effects", "delay,coulomb", "--out", out)
+    values = "mechanism_keys={gain: 2.0, inertia: 0.004, viscous: 0.09}"
+    code, _, error = cli(*given, values, "exact=gain,inertia,time", "known={viscous: 0.1 %}")
+    assert code == 0 and not error
+    found = json.loads((out / "diagnosis.json").read_text())
+    assert found["verdict"]["effects"] == ["coulomb"] and found["verdict"]["probability"] > 0.95
+    assert found["effects"][0]["parameters"]["q1 coulomb"]["value"] == pytest.approx(0.0024, rel=0.2)
+    for words, sentence in {
+        ("exact=gian",): "exact: there is no value 'gian'; 'gain' is the nearest",
+        ("known={mass: 2 mm}",): "known.mass is in 'mm', a length",
+        ("known={mass: 120 %}",): "known.mass: must be a share from 0 up to below 1, such as 2 %, not 120 %",
+        ("exact=mass", "known={mass: 2 %}"): "known.mass: it stands in exact as well",
+    }.items():
+        code, _, error = cli(*given, values, *words)
+        assert code == 2 and sentence in error and error.count("\n") == 1, error
+    code, _, error = cli("diagnose", "--records", log, "--mechanism", "five_bar", "--out", out, "exact=gain")
+    assert code == 2 and "exact and known: tell how well" in error
+
+
+def test_a_log_that_is_thinned_keeps_the_commands_between_its_samples(tmp_path: Path) -> None:
+    # A slide of 80 kg, sampled at 200 Hz, of which every other sample is evaluated: with straight lines between those
+    # it would err by 14 um.
+    time = np.arange(0, 3, 5e-4)
+    asked = 0.1 * (1 - np.cos(2 * np.pi * time / 1.2))
+    position = lsim(([1e6], [80.0, 7000.0, 1e6]), asked, time)[1]
+    rows = np.stack([time, asked, position], -1)[::10]
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="time[s],command1[m],q1[m]", comments="")
+    nominal = nominal_of("servo", {"gain": 1e6, "inertia": 80.0, "viscous": 7000.0}, ["m"])
+    problem = problem_of(load_logs([tmp_path / "log.csv"]), nominal, motion_effects(["delay"]))
+    left = problem.residual(torch.zeros(1, problem.library.size, dtype=torch.float64), problem.axes)
+    assert float(left[:, problem.data.judged].square().mean().sqrt()) < 4e-6
 
 
 def test_a_flexible_joint_is_seen_from_the_motor(tmp_path: Path) -> None:
