@@ -27,6 +27,8 @@ _GAP, _LATE = 6.0, 1.6
 _JUMP, _USUAL = 12.0, 0.995
 # A position that jumps by a whole turn, to this share, was wrapped by its counter.
 _TURN, _TURN_SLACK = 2 * np.pi, 0.1
+# Whole numbers from here on are counts.
+_COUNTS = 1000.0
 # Samples with no output of the drive at all from which it is taken to be off, and the error that it then must have, as
 # a share of the motion.
 _OFF, _OFF_ERROR = 20, 0.1
@@ -93,6 +95,7 @@ def _of_source(source: str | Path | Frame | Table, columns: Mapping[str, str] | 
     command, position = (
         np.stack([table.column(f"{kind}{i + 1}", units[i]) for i in range(count)], -1) for kind in ("command", "q")
     )
+    _refuse_counts(table, units, position)
     time = table.column("time", "s")
     beside = {n: table.column(n, unit) for n, unit in _SHARED.items() if n in table}
     for kind, unit in _EACH.items():
@@ -126,10 +129,15 @@ def _joints(table: Table) -> int:
         for kind, pattern in (("command", _COMMAND), ("q", _POSITION))
     }
     count = max(*found["command"], *found["q"], 1) if found["command"] | found["q"] else 1
-    for kind, there in found.items():
-        for i in range(1, count + 1):
-            if i not in there:
-                table.column(f"{kind}{i}")
+    wanted = ["time", *(f"{kind}{i}" for kind in found for i in range(1, count + 1))]
+    for name in (name for name in wanted if name not in table):
+        others = [table.header(own) for own in table.names if own not in wanted]
+        unit = "s" if name == "time" else "rad"
+        first, some = (others or ["header"])[0], ", ".join(others)
+        raise InputError(
+            f"{table.path}: there is no column '{name}'; a log has time[s], command1[rad] and q1[rad] (or deg, mm): "
+            f"rename its headers ({some}), or say what each is: columns={{'{first}': '{name}[{unit}]'}}"
+        )
     return count
 
 
@@ -151,6 +159,17 @@ def _unit(table: Table, position: str, command: str) -> str:
             "that follows it have one unit"
         )
     return units[0]
+
+
+def _refuse_counts(table: Table, units: tuple[str, ...], position: Array) -> None:
+    """Raise `InputError` where an encoder's counts stand under the name of a unit."""
+    for i, values in enumerate(position.T):
+        if np.abs(values).max(initial=0.0) >= _COUNTS and not np.any(values % 1):
+            turn = "2 pi over its counts in a turn" if units[i] == "rad" else "the length of a count"
+            raise InputError(
+                f"{table.path}: q{i + 1} has whole numbers up to {np.abs(values).max():.0f} {units[i]}, which are "
+                f"counts of an encoder; multiply it, and command{i + 1} if it is in counts, by {turn}"
+            )
 
 
 def _log(

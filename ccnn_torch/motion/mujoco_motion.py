@@ -199,6 +199,7 @@ def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> 
     if keys:
         raise InputError(f"mechanism_keys: an MJCF takes none, and {', '.join(keys)} was given; write it in {path}")
     mujoco, spec = mujoco_spec(path)
+    free = _hold_base(mujoco, spec, compiled(mujoco, path, spec))
     model = compiled(mujoco, path, spec)
     held = [k for k in range(model.nu) if model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT]
     position = [k for k in held if model.actuator_biasprm[k, 1] < 0 and model.actuator_gainprm[k, 0] > 0]
@@ -230,8 +231,27 @@ def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> 
         (None,) * len(joints),
         heaviest=float(model.body_mass.sum()),
         loaded=lambda time, commands, measured: loaded_motion(path, model, joints, values, time, commands, measured),
-        notes=(f"{Path(path).name}: simulated from rest at each log's first command",),
+        notes=(
+            f"{Path(path).name}: simulated from rest at each log's first command",
+            *(
+                f"{Path(path).name}: '{body}' is free, and was held in mid-air; so must it be in the logs"
+                for body in free
+            ),
+        ),
     )
+
+
+def _hold_base(mujoco: Any, spec: Any, model: Any) -> list[str]:
+    """Fix bodies that carry actuators and are free, which no log tells the pose of, in mid-air; their names."""
+    moved = {body for joint in model.actuator_trnid[:, 0] for body in _down(model, int(model.jnt_bodyid[joint]))}
+    free = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE and model.jnt_bodyid[j.id] in moved]
+    names = [joint.parent.name for joint in free]
+    if free:
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    # A keyframe has a place for the pose of each.
+    for element in (*free, *(spec.keys if free else ())):
+        spec.delete(element)
+    return names
 
 
 # No body is lighter [kg].
@@ -256,12 +276,15 @@ def write_mjcf(
     """
     import mujoco
 
-    spec = mujoco.MjSpec.from_file(source)
-    model = spec.compile()
+    spec, held = mujoco.MjSpec.from_file(source), mujoco.MjSpec.from_file(source)
+    full = spec.compile()
+    # What is identified is what an axis has while its base is held.
+    _hold_base(mujoco, held, held.compile())
+    model = held.compile()
     joints = [int(number) for number in model.actuator_trnid[: len(axes), 0]]
     for k, (axis, gain) in enumerate(zip(axes, gains, strict=True)):
         unit = gain or 1.0
-        joint = next(j for j in spec.joints if j.id == joints[k])
+        joint = next(j for j in spec.joints if j.id == full.actuator_trnid[k, 0])
         dof = int(model.jnt_dofadr[joints[k]])
         actuator = spec.actuators[k]
         # The gain stands for itself and for the position's part of the force.

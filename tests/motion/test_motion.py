@@ -231,6 +231,12 @@ def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: C
         "no command moves": one | {"command1[rad]": 0 * t},
         "q1 never moves while command1 does": one | {"q1[rad]": 0 * t},
         "there is no column 'q1'": {n: v for n, v in one.items() if n != "q1[rad]"},
+        "rename its headers (pos), or say what each is: columns={'pos': 'q1[rad]'}": {
+            n.replace("q1[rad]", "pos"): v for n, v in one.items()
+        },
+        "q1 has whole numbers up to 2048 rad, which are counts of an encoder; multiply it, and command1": {
+            n: v if n == "time[s]" else np.round(2048 * v / np.abs(v).max()) for n, v in one.items()
+        },
         "must be an angle or a length": {n.replace("q1[rad]", "q1[K]"): v for n, v in one.items()},
     }
     for sentence, columns in cases.items():

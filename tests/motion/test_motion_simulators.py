@@ -175,6 +175,28 @@ def test_what_one_joint_of_an_arm_does_is_no_finding_at_the_others(tmp_path: Pat
     assert {name: v["value"] for name, v in told.items()} == {"q2 viscous": pytest.approx(10.0, rel=0.02)}
 
 
+def test_a_base_that_is_free_is_held_in_mid_air_and_free_in_what_is_written(tmp_path: Path) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    fixed, model, new = write_mjcf(tmp_path / "fixed.xml"), tmp_path / "model.xml", tmp_path / "new.xml"
+    # The pendulum would hit the floor; the ball beside it is no base.
+    base = '<body name="trunk" pos="0 0 0.05"><freejoint/><geom type="sphere" size="0.02" mass="3"/><body>'
+    ball = '<body pos="1 0 1"><freejoint/><geom size="0.01"/></body>'
+    keys = '<keyframe><key qpos="0 0 0.05 1 0 0 0 0 1 0 1 1 0 0 0"/></keyframe>'
+    text = fixed.read_text().replace("<body>", f'<geom type="plane" size="1 1 1"/>{base}')
+    text = text.replace("</body></worldbody>", f"</body></body>{ball}</worldbody>{keys}")
+    model.write_text(text)
+    time = np.arange(0, 2, 0.01)
+    asked = command(0, time)[:, None]
+    nominal, plain = (nominal_of(str(path), {}, ["rad"]) for path in (model, fixed))
+    assert nominal.loaded is not None and plain.loaded is not None
+    assert nominal.loaded(time, asked, None).positions == pytest.approx(plain.loaded(time, asked, None).positions)
+    assert any("'trunk' is free, and was held in mid-air" in note for note in nominal.notes)
+    write_new_values(str(model), new, [{"gain": 1.0, "weakness": 0.0, "coulomb": 0.1, **nominal.axes[0]}], [GAIN], 0.0)
+    old, better = (mujoco.MjModel.from_xml_path(str(path)) for path in (model, new))
+    assert better.nq == old.nq == 15 and better.dof_frictionloss[6] == pytest.approx(0.1 * GAIN)
+    assert better.dof_armature == pytest.approx(old.dof_armature)
+
+
 class Stiff:
     """A servo whose positions are far from linear in its parameters; only their ratios show."""
 
