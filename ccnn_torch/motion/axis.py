@@ -89,7 +89,7 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     tensors = {n: parameters.get(n, like.new_full((1, 1), v)).expand(shape) for n, v in ABSENT.items()}
     u, torque = drive.command, drive.torque
     if bool((tensors["delay"] != 0).any()):
-        u = delayed(drive.time, u, tensors["delay"])
+        u = torch.where(tensors["delay"][..., None] != 0, delayed(drive.time, u, tensors["delay"]), u)
     u = u.expand(*shape, -1) + tensors["offset"][..., None]
     a = {n: v.numpy() for n, v in tensors.items()}
     steps = drive.time.diff(dim=-1).numpy().T
@@ -97,8 +97,9 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     commands = np.ascontiguousarray(u.permute(2, 0, 1).numpy())
     push = None if torque is None else np.ascontiguousarray(torque.expand(*shape, -1).permute(2, 0, 1).numpy())
     if np.any(a["slowness"] > 0):
-        begin = np.where(a["slowness"] > 0, _held_at(drive, push, a), commands[0])
-        commands = _limited(steps, commands, 1 / np.maximum(a["slowness"], TINY), begin)
+        slow = a["slowness"] > 0
+        limited = _limited(steps, commands, 1 / np.maximum(a["slowness"], TINY), _held_at(drive, push, a))
+        commands = np.where(slow, limited, commands)
     if np.any(a["derivative"]):
         commands = commands + _lead(steps, commands, a["derivative"], a["integral"])
         # The other half of it resists the speed, within the limit of the motor.
@@ -116,10 +117,33 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
 
 def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[str, Array]) -> Array:
     """What the encoder shows but for a play, `s x p x b`."""
-    # The fastest motion of the axis is that of its mass on the gain.
+    # The fastest motion of an axis is that of its mass on the gain: each has steps of its own, whatever is beside it.
     masses = a["inertia"] / np.maximum(a["gain"], TINY)
-    fast = math.sqrt(float(masses[masses > 0].min())) if np.any(masses > 0) else math.inf
-    parts = int(min(max(math.ceil(float(np.median(steps)) / max(fast, TINY) / _LONGEST), 1), _MOST_PARTS))
+    fast = np.sqrt(np.where(masses > 0, masses, math.inf))
+    many = np.clip(np.ceil(np.median(steps, 0) / np.maximum(fast, TINY) / _LONGEST), 1, _MOST_PARTS)
+    found = np.empty_like(u)
+    for parts in np.unique(many):
+        here = many == parts
+        if here.all():
+            return _divided(drive, steps, u, push, a, int(parts))
+        runs = np.nonzero(here)[1]
+        own = Drive._make(None if v is None else v[runs] for v in drive)
+        some = None if push is None else push[:, here]
+        values = {name: value[here] for name, value in a.items()}
+        found[:, here] = _divided(own, steps[:, runs], u[:, here], some, values, int(parts))
+    return found
+
+
+def _divided(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[str, Array], parts: int) -> Array:
+    """The same of axes all of whose steps are divided into so many parts; `...` is `p x b`, or what was chosen of it.
+
+    Args:
+        drive: of the runs of the last dimension.
+        steps: of time, `(s - 1) x b`.
+        u, push: `s x ...`.
+        a: parameters, `...`.
+        parts: of a step.
+    """
     start = drive.start.numpy()
     q, v = (np.broadcast_to(start[:, k], u.shape[1:]) for k in range(2))
     faster = start[:, 2] if start.shape[1] > 2 else np.zeros(len(start))
@@ -127,7 +151,7 @@ def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[
     state = rule.begun(q, v, faster, u[0], None if push is None else push[0])
     share = None
     if np.any(a["supply"]) and drive.supply is not None and bool((drive.supply != 0).any()):
-        share = np.maximum(1 + a["supply"] * drive.supply.numpy().T[:, None], 0)
+        share = [np.maximum(1 + a["supply"] * supply, 0) for supply in drive.supply.numpy().T]
     warm = drive.warm.numpy().T if np.any(a["thermal"]) and drive.warm is not None else None
     bend = None if drive.bent is None else _bend(u) * drive.bent.numpy()
     found = np.empty_like(u)

@@ -49,6 +49,10 @@ ABSENT: dict[str, float] = {
 Array = NDArray[np.float64]
 GAMMA = 1 - 1 / math.sqrt(2)
 TINY = 1e-9
+# How steep a wave is followed: shares of what gain and friction, and inertia, resist a motion with within a stage.
+_STEEP, _SWINGING = 0.5, 0.05
+# Largest slope of exp(-x^2).
+_STEEPEST = math.sqrt(2 / math.e)
 # rad/s or m/s: no axis is faster, and no number may overflow.
 _FASTEST = 1e4
 
@@ -155,19 +159,26 @@ class Rule:
             carried = np.where(self.hung, pulled, carried)
             against = np.where(self.hung, self.stiffness * (apart - fixed.drag * loose), against)
         free = fixed.mass * v - against
+        light = fixed.light
         if self.waves:
-            free = free - self.wave * np.sin(a["cogging_order"] * q + self.phase)
+            # Linearised, and no steeper than a stage can follow: else the last digit would decide where it goes.
+            order, steepest = a["cogging_order"], _STEEP * (light - fixed.mass + fixed.stiff) + _SWINGING * fixed.mass
+            wave = np.minimum(self.wave * order, steepest / h)
+            free = free - wave / order * np.sin(order * q + self.phase)
+            light = light + h * wave * np.cos(order * q + self.phase)
         friction = fixed.dry
         if self.has["stribeck"]:
-            friction = friction + a["stribeck"] * np.exp(-np.square(v / a["stribeck_speed"]))
-        speed = self.solved(free, motor, friction, carried, fixed.light, fixed.stiff)
+            # So does it fall with the speed.
+            least = _STEEPEST * a["stribeck"] / (light + fixed.stiff)
+            friction = friction + a["stribeck"] * np.exp(-np.square(v / np.maximum(a["stribeck_speed"], least)))
+        speed = self.solved(free, motor, friction, carried, light, fixed.stiff)
         if self.has["weakness"]:
             # The part of the damping that the drive makes is within its limit.
             torque = motor - (fixed.stiff + a["drive_damping"]) * speed
             held = np.minimum(np.maximum(torque, -limit), limit)
             if not np.array_equal(held, torque):
-                light = np.maximum(fixed.light - a["drive_damping"], TINY)
-                weak = self.solved(free, held, friction, carried, light, 0 * held)
+                lighter = np.maximum(light - a["drive_damping"], TINY)
+                weak = self.solved(free, held, friction, carried, lighter, 0 * held)
                 speed = np.where(torque == held, speed, weak)
         speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)
         ended: State = q + h * speed, speed

@@ -167,3 +167,34 @@ def test_what_one_model_has_changes_nothing_of_those_beside_it() -> None:
     for other in ("slowness", "weakness", "flexibility", "play", "derivative", "stribeck"):
         beside = simulate_axes(drive, shared | {other: torch.tensor([[0.0], [0.05]]).double()})
         assert (beside[0] - alone).abs().max() < 1e-9, other
+
+
+def lot(sets: list[dict[str, float]], asked: np.ndarray) -> np.ndarray:
+    """Positions of axes with other parameters each, simulated side by side."""
+    t, u = (torch.from_numpy(v).expand(len(sets), -1) for v in (TIME, asked))
+    start = torch.tensor([[asked[0], 0.0]], dtype=torch.float64).expand(len(sets), -1)
+    torque = 0.01 * torch.sin(3 * t)
+    names = {name for one in sets for name in one}
+    values = {n: torch.tensor([[one.get(n, ABSENT[n]) for one in sets]], dtype=torch.float64) for n in names}
+    return simulate_axes(Drive(t, u, start, torque=torque), values)[0].numpy()
+
+
+def test_an_axis_moves_the_same_beside_any_other() -> None:
+    # The light one needs more steps than the others.
+    sets = [OWN, {"inertia": 1e-6}, {}, OWN | {"delay": 0.013}, OWN | {"slowness": 0.4}, {"viscous": 0.05}]
+    sets += [OWN | {"cogging_sin": 0.02, "cogging_order": 42.0}, OWN | {"stribeck": 0.05, "coulomb": 0.02}]
+    sets += [OWN | {"flexibility": 1e-3, "load": 5e-4}, OWN | {"weakness": 8.0}, OWN | {"play": 0.01}]
+    sets += [OWN | {"integral": 3.0}, OWN | {"derivative": 0.02}, OWN | {"load_friction": 0.2, "gravity_sin": 0.1}]
+    beside = lot(sets, command(0, TIME))
+    for one, row in zip(sets, beside, strict=True):
+        assert np.array_equal(lot([one], command(0, TIME))[0], row), one
+
+
+def test_the_last_digit_of_a_command_decides_nothing() -> None:
+    sets = [{"cogging_sin": 0.04, "cogging_order": 84.0}, {"stribeck": 0.05, "stribeck_speed": 0.02, "viscous": 0.01}]
+    sets += [{"stribeck": 0.1, "coulomb": 0.05, "load_friction": 0.3}, OWN | {"stribeck": 0.1, "stribeck_speed": 0.01}]
+    sets += [{"inertia": 1e-6, "cogging_sin": 0.03, "cogging_order": 150.0, "coulomb": 0.01}]
+    asked = command(1, TIME)
+    rounded = asked * (1 + 2.3e-16 * np.random.default_rng(1).choice([-1, 0, 1], len(asked)))
+    moved_by = np.abs(lot(sets, asked) - lot(sets, rounded)).max(-1)
+    assert (moved_by < 1e-9).all(), moved_by
