@@ -78,6 +78,41 @@ def diagnose_motion(
     Raises:
         InputError: the logs cannot be diagnosed.
     """
+    found = _diagnosed(logs, nominal, effects, noise, seed)
+    apart = _apart(found)
+    if apart is None:
+        return found
+    number, times = apart
+    caution = (
+        f"{logs[number].name} leaves {times:.2g} times as much as any other run and was left out: what acts there "
+        "alone (a contact, a load) would hide what all share; diagnose it by itself"
+    )
+    others = _diagnosed([*logs[:number], *logs[number + 1 :]], nominal, effects, noise, seed, [caution])
+    return others if others.content["verdict"]["effects"] else found
+
+
+def _apart(found: MotionDiagnosis) -> tuple[int, float] | None:
+    """The run that leaves far more of some joint than any other, and how much more."""
+    data, runs = found.problem.data, sorted(set(found.problem.data.run.tolist()))
+    if len(runs) < _FEWEST_RUNS:
+        return None
+    for own in found.after.square() * data.judged:
+        left = torch.stack([own[data.run == r].sum() / data.judged[data.run == r].sum() for r in runs]).sqrt()
+        second, first = left.sort().values[-2:].tolist()
+        if first > _APART * second:
+            return runs[int(left.argmax())], first / second
+    return None
+
+
+def _diagnosed(
+    logs: Sequence[Log],
+    nominal: Nominal,
+    effects: Sequence[str] | None,
+    noise: float | None,
+    seed: int,
+    cautions: Sequence[str] = (),
+) -> MotionDiagnosis:
+    """As `diagnose_motion`, of all logs; cautions: beside those of the verdict."""
     at_step("searching the effects")
     candidates = motion_effects(effects)
     problem = problem_of(logs, nominal, [*candidates, *nominal.own_effects])
@@ -119,12 +154,14 @@ def diagnose_motion(
         verdict=verdict_block(names, math.prod(v.probability for v in verdicts), total, bool(drivers), drivers),
         next_measurements=wanted,
         not_seen={n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
-        cautions=_hidden_of(problem, verdicts),
+        cautions=[*cautions, *_hidden_of(problem, verdicts)],
         notes=_notes_of(folded, nominal, found, total.floor, noise),
     )
     return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed, nominal)
 
 
+# A run is apart that leaves so many times as much as any other, of so many at least.
+_APART, _FEWEST_RUNS = 4.0, 3
 _SHAPE_UNITS = {"flexible_damping": "1", "play_loaded": "1", "encoder_at_motor": "1"}
 # Of those that are over the unit of the axis.
 _OVER = {"play_friction": "s^2"}

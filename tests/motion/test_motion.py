@@ -196,6 +196,29 @@ def test_a_log_that_is_thinned_keeps_the_commands_between_its_samples(tmp_path: 
     assert float(left[:, problem.data.judged].square().mean().sqrt()) < 4e-6
 
 
+def test_cogging_of_many_poles_is_named_with_its_order(tmp_path: Path) -> None:
+    # Of 14 poles and 12 slots.
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, teeth=0.02)
+    found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), ["cogging", "viscous"]).content
+    assert found["verdict"]["effects"] == ["cogging"]
+    values = found["effects"][0]["parameters"]
+    assert values["q1 cogging_order"]["value"] == pytest.approx(84, abs=0.5)
+    assert values["q1 sin"]["value"] == pytest.approx(0.02, rel=0.1)
+
+
+def test_a_run_that_touches_a_wall_does_not_hide_what_all_share(tmp_path: Path) -> None:
+    lines = write_log(tmp_path / "log.csv", (0, 1, 2), 2.4, dry=0.1).read_text().splitlines()
+    cells = [line.split(",") for line in lines[1:]]
+    # The second one stops at 0.3 rad.
+    rows = [f"{t},{run},{u},{min(float(q), 0.3) if run == '1' else q}" for t, run, u, q in cells]
+    (tmp_path / "log.csv").write_text("\n".join([lines[0], *rows]) + "\n")
+    nominal = nominal_of("servo", KEYS, ["rad"])
+    found = diagnose_motion(load_logs([tmp_path / "log.csv"]), nominal, ["delay", "coulomb"]).content
+    assert found["verdict"]["effects"] == ["coulomb"] and found["verdict"]["probability"] > 0.9
+    assert found["effects"][0]["parameters"]["q1 coulomb"]["value"] == pytest.approx(0.1, rel=0.1)
+    assert "run 1 leaves" in found["cautions"][0] and "was left out" in found["cautions"][0]
+
+
 def test_a_flexible_joint_is_seen_from_the_motor(tmp_path: Path) -> None:
     spring, seen = 1.5, {"damping": 0.01, "at_motor": True}
     log = write_log(tmp_path / "log.csv", (0, 1), 2.4, moved_on_a_spring, spring=spring, **seen)

@@ -9,7 +9,7 @@ from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add
 FEWEST = 6.0
 """Periods in a turn: a motor has no fewer (the least common multiple of 3 slots and 2 poles), and a gear more teeth.
 Fewer are a weight, or any other smooth function of the position."""
-# Orders that are tried, and the largest.
+# Orders that are tried whatever the logs show, and the largest of them.
 _TRIED, _HIGHEST = 14, 60.0
 # Seconds in which friction stops a load that is nearly as fast as the axis ever is.
 _STOPPED = 0.5
@@ -19,7 +19,8 @@ def _orders(axis: Facts) -> list[dict[str, float]]:
     # Periods from the whole motion on.
     lowest = max(FEWEST, 2 * math.pi / axis.span) if axis.unit == "rad" else 4 * math.pi / axis.span
     ratio = max(_HIGHEST / lowest, 6.0) ** (1 / (_TRIED - 1))
-    return [{"cogging_order": lowest * ratio**k} for k in range(_TRIED)]
+    tried = [lowest * ratio**k for k in range(_TRIED)]
+    return [{"cogging_order": order} for order in (*tried, *(order for order in axis.ripples if order > lowest))]
 
 
 def _swinging(frequency: float) -> float:
