@@ -155,7 +155,7 @@ def _diagnosed(
         next_measurements=wanted,
         not_seen={n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
         cautions=[*cautions, *_hidden_of(problem, verdicts)],
-        notes=_notes_of(folded, nominal, found, total.floor, noise),
+        notes=_notes_of(folded, nominal, found, verdicts, total.floor, noise),
     )
     return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed, nominal)
 
@@ -235,13 +235,35 @@ def _hidden_of(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
     ]
 
 
-def _notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None) -> list[str]:
+def _only_ratios(library: Library, verdicts: Sequence[AxisVerdict]) -> list[str]:
+    """Where a gain is named, and what else it may be; a sentence each without a full stop."""
+    notes = []
+    for i, verdict in enumerate(verdicts):
+        parameters = library.parameters(verdict.best.spec.theta[None], torch.tensor([i]))
+        gain = float(parameters.get("gain", torch.ones(1))[0])
+        if library.facts[i].nominal.get("inertia") and gain != 1:
+            notes.append(
+                f"q{i + 1}: the logs tell torques over the gain alone: a gain {gain:.3g} times that of the model is "
+                f"the same as inertia, friction and weight {1 / gain:.3g} times theirs"
+            )
+    return notes
+
+
+def _notes_of(
+    problem: Problem,
+    nominal: Nominal,
+    found: Search,
+    verdicts: Sequence[AxisVerdict],
+    floor: float,
+    noise: float | None,
+) -> list[str]:
     data = problem.data
     notes = [*data.notes, *nominal.notes]
     held = [f"q{i + 1}" for i, asked in enumerate(data.command[:, data.judged]) if bool((asked == asked[0]).all())]
     notes += [f"no log moves {listed(held)}: of such joints little can be told"] if held else []
     library = problem.library
     notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
+    notes += _only_ratios(library, verdicts)
     runs, folds = len(set(data.run.tolist())), int(problem.fold.max()) + 1
     if problem.parted and runs > 1:
         notes.append(f"what is named acts in one run alone: {folds} parts of the runs were held out in turn")

@@ -17,6 +17,7 @@ from ccnn_torch.evidence.priors import EFFECT, crowd
 from ccnn_torch.motion.fit import fit_many, form_errors, products, sensitivities, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.servo import TORQUES
 from ccnn_torch.motion.spec import Fit, Spec, started, without
 from ccnn_torch.motion.whiten import Whitening, fitted_whitening, white_noise
 
@@ -72,6 +73,8 @@ def search(problem: Problem) -> Search:
     final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged), theta)
     final.again(pool)
     final.neighbours()
+    if final.twins():
+        final.neighbours()
     final.reduced()
     ranked = tuple(tuple(p) for p in final.ranked())
     # Sets that are probable although forms are wrong are smaller than those above.
@@ -176,6 +179,18 @@ class _Pool:
             if all(a.members == b.members for a, b in zip(before, self.best(), strict=True)):
                 return
 
+    def twins(self) -> bool:
+        """The most probable sets with another gain in the place of an inertia; whether one of them is the best now."""
+        if self.problem.known.get("gain") == 0:
+            return False
+        before, wanted = self.best(), []
+        for i, ranked in enumerate(self.ranked()):
+            twins = [t for f in ranked[:_KEPT] if (t := with_gain(self.library, i, f.spec)) is not None]
+            # Friction that was too large by as much as the inertia is none beside the gain.
+            wanted.append([*twins, *(without(self.library, t, k) for t in twins for k in range(len(t.members)))])
+        self.fit(wanted, _LONG)
+        return any(a.members != b.members for a, b in zip(before, self.best(), strict=True))
+
     def reduced(self) -> None:
         """The most probable set of each axis without its least members, one after the other, down to none."""
         now = [f.spec for f in self.best()]
@@ -203,6 +218,30 @@ class _Pool:
             for spec in islice(new, most):
                 wanted[i].setdefault(spec.members, spec)
         return [list(w.values()) for w in wanted]
+
+
+def with_gain(library: Library, axis: int, spec: Spec) -> Spec | None:
+    """The same machine with another gain in the place of another inertia, since all torques are over the gain; None
+    where that cannot be said."""
+    names, known = library.names, library.nominal.get("inertia")
+    effects = [names.index(name) if name in names else -1 for name in ("inertia", "servo_gain")]
+    inertia, gain = effects
+    if min(effects) < 0 or inertia not in spec.members or gain in spec.members or known is None or not known[axis]:
+        return None
+    of_axis = library.numbers[axis]
+    place = library.places[inertia][0]
+    times = 1 + float(spec.theta[place]) * of_axis[place].scale / float(known[axis])
+    variant = next(v for v in library.variants[gain] if of_axis[v.active[0]].acts[0].how == "factor")
+    if times <= 0:
+        return None
+    other = started(library, without(library, spec, spec.members.index(inertia)), variant, axis)
+    other.theta[variant.active[0]] = -math.log(times) / of_axis[variant.active[0]].scale
+    for j in other.flat:
+        name, factor, how = of_axis[j].acts[0]
+        if how == "add" and name in TORQUES and factor:
+            size, nominal = of_axis[j].scale * factor, float(library.nominal.get(name, {axis: 0.0})[axis])
+            other.theta[j] = ((nominal + float(other.theta[j]) * size) / times - nominal) / size
+    return other
 
 
 def promise(

@@ -13,6 +13,8 @@ from motion.servo import GAIN, INERTIA, LENGTH, LOAD, MASS, VISCOUS, command, mo
 from ccnn_torch.motion.axis import ABSENT, Drive, simulate_axes
 from ccnn_torch.motion.effects import EFFECTS, Facts, motion_effects
 from ccnn_torch.motion.library import library_of
+from ccnn_torch.motion.search import with_gain
+from ccnn_torch.motion.spec import Spec
 
 
 def axis(time: np.ndarray, asked: np.ndarray, **parameters: float) -> np.ndarray:
@@ -198,3 +200,25 @@ def test_the_last_digit_of_a_command_decides_nothing() -> None:
     rounded = asked * (1 + 2.3e-16 * np.random.default_rng(1).choice([-1, 0, 1], len(asked)))
     moved_by = np.abs(lot(sets, asked) - lot(sets, rounded)).max(-1)
     assert (moved_by < 1e-9).all(), moved_by
+
+
+def test_another_gain_is_another_inertia_and_friction() -> None:
+    # All torques are over the gain.
+    tried = ["servo_gain", "inertia", "viscous", "coulomb"]
+    facts = Facts("rad", {"inertia": 0.002, "viscous": 0.05, "coulomb": 0.01}, gain=2.0)
+    library = library_of(motion_effects(tried), [facts])
+    theta = torch.zeros(library.size, dtype=torch.float64)
+    numbers = {number.name: j for j, number in enumerate(library.numbers[0])}
+    for name, value in {"inertia": 0.006, "viscous": 0.02, "coulomb": 0.03}.items():
+        theta[numbers[name]] = value / library.numbers[0][numbers[name]].scale
+    own = [library.names.index(name) for name in ("inertia", "viscous", "coulomb")]
+    spec = Spec(tuple(sorted(own)), theta, tuple((library.places[e][0],) for e in sorted(own)), 0.0)
+    other = with_gain(library, 0, spec)
+    assert other is not None and {library.names[m] for m in other.members} == {"servo_gain", "viscous", "coulomb"}
+    sets = [library.parameters(one.theta[None], torch.tensor([0])) for one in (spec, other)]
+    assert float(sets[1]["gain"]) == pytest.approx(0.25)
+    a, b = (axis(TIME, command(0, TIME), **{n: float(v) for n, v in one.items()}) for one in sets)
+    assert a == pytest.approx(b, abs=1e-9)
+    for without in (["inertia", "viscous"], ["servo_gain", "viscous"]):
+        few = library_of(motion_effects(without), [facts])
+        assert with_gain(few, 0, Spec((1,), torch.ones(few.size, dtype=torch.float64), ((0,),), 0.0)) is None

@@ -345,6 +345,20 @@ def test_a_derivative_gain_is_told_in_seconds_over_the_proportional_one(tmp_path
     assert parameters["q1 derivative gain"]["value"] == pytest.approx(0.02, rel=0.03)
 
 
+def test_gains_that_are_many_times_too_high_in_the_model_are_told_as_such(tmp_path: Path) -> None:
+    # In a unit that is 2 pi too large: the velocity gain is part of the model's viscous friction.
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, dry=0.02)
+    model = KEYS | {"gain": 2 * np.pi * GAIN, "viscous": VISCOUS + (2 * np.pi - 1) * 0.07, "coulomb": 0.02}
+    tried = ["servo_gain", "viscous", "inertia", "coulomb"]
+    found = diagnose_motion(load_logs([log]), nominal_of("servo", model, ["rad"]), tried).content
+    assert sorted(found["verdict"]["effects"]) == ["servo_gain", "viscous"]
+    effects = {e["name"]: e for e in found["effects"]}
+    gain, viscous = (effects[name]["parameters"] for name in ("servo_gain", "viscous"))
+    assert gain["q1 proportional gain"]["value"] == pytest.approx(1 / (2 * np.pi) - 1, abs=0.005)
+    assert viscous["q1 viscous"]["value"] == pytest.approx(-(2 * np.pi - 1) * 0.07, rel=0.03)
+    assert any("is the same as inertia, friction and weight 6.2" in note for note in found["notes"])
+
+
 def test_integral_action_is_named_with_its_integral_gain(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.csv", (0, 1), 2.4, integral=2.0, weight=0.3)
     nominal = nominal_of("servo", KEYS | {"gravity_sin": 0.3}, ["rad"])
