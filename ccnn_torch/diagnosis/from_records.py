@@ -285,7 +285,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
             situation = in_time(situation, elapsed(next(times)))
             known.append(frame_drift(situation, drift))
         loose = loose_parameters(situation.mechanism, identify)
-        fine = (analysis.whitening.weight > 0) & ~analysis.near_singular
+        fine = analysis.whitening.counted & ~analysis.near_singular
         acting, values = fit_jointly(situation, analysis.measured, known, fine, loose)
         acting = [a for a in acting if a.effect.name != FrameDrift.name]
         if grouped:

@@ -67,7 +67,7 @@ def fit_jointly(
     for turn in range(_ROUNDS + 1):
         rows = model.about(at, measured, usable)
         white = rows.whitening() if white is None else white
-        white = replace(white, weight=torch.where(rows.fine, white.weight, 0.0))
+        white = replace(white, weight=torch.where(rows.fine[:, None], white.weight, 0.0))
         if before is not None and white(rows.left).square().sum() > white(before[0]).square().sum():
             # A step that leads away from the rows.
             at = before[1]
@@ -248,7 +248,7 @@ class _Rows:
         white = fitted_whitening(self.target, columns, channels, None, self.fine, self.seen, device_axes(here))
         left = white.picked(self.left) / white.sigma
         near = inlying(left.norm(dim=-1), self.fine, len(white.channels), 0)
-        return replace(white, weight=(self.fine & near).to(left.dtype))
+        return replace(white, weight=(self.fine & near)[:, None].expand_as(left).to(left.dtype))
 
     def grams(self, white: Whitening) -> Grams:
         return grams_of(white(self.columns), white(self.target))._replace(

@@ -24,6 +24,8 @@ _NEAR_LIBRARY = math.log(1e-2)
 _TWIN = 2 * OUTSIDE
 # A joint may be off by this much for unforeseen reasons [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
+PLACE = "workspace"
+"""The driver of what follows the pose."""
 ANY = "*"
 """Stands in a driver's name for all of its kind; a verdict names the one that explains most alone."""
 SPEED = "speed"
@@ -59,11 +61,9 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
     few = max(_FEWEST, min(_FEW, rows // _ROWS_A_BUMP))
     around = torch.cat([one, place, _bumps(place, min(_PLACES, max(_FEWEST_PLACES, rows // _ROWS_A_PLACE)))], -1)
     most = min(_MOST_PLACES, max(_MOST, rows // _ROWS_A_COLUMN))
-    found = [_atom(situation, "workspace", around, most=most)]
+    found = [_atom(situation, PLACE, around, most=most)]
     found.append(
-        _atom(
-            situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most, log_odds=_NEAR_LIBRARY
-        )
+        _atom(situation, PLACE, torch.cat([one, *_configuration(situation)], -1), most=most, log_odds=_NEAR_LIBRARY)
     )
     own: list[Tensor] = []
     for i, joint in enumerate(mechanism.joints):

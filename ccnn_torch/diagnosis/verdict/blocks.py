@@ -93,7 +93,7 @@ def noise_floor(analysis: Analysis) -> Tensor:
     free = max(1 - best.effective / analysis.dictionary.grams.values, LEAST_FREE)
     # No more than the richest fit leaves.
     share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)
-    noise = (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * share
+    noise = (left / white.weight[keep].sqrt() * white.sigma).square().mean(0) / free * share
     return noise if white.times is None else noise * white.times
 
 
