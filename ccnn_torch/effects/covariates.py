@@ -8,7 +8,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.columns import inside
+from ccnn_torch.effects.columns import force_of, inside, torque_of
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.effects.time import REFERENCE, ROW
 from ccnn_torch.mechanisms import Mechanism
 
@@ -71,9 +72,16 @@ def directions(joints: Tensor, before: Tensor) -> dict[str, Tensor]:
     return {f"direction{i + 1}": sign for i, sign in enumerate(signs.unbind(-1))}
 
 
+def rest_torques(situation: Situation) -> dict[str, Tensor]:
+    """`torque_NAME` of each joint, `... x s` [N or N·m]: what 100 N of own weight and the load put on it at rest."""
+    torques = PLATFORM_WEIGHT * situation.own_weight_torque + situation.load_torque
+    return {torque_of(j): torques[..., i] for i, j in enumerate(situation.mechanism.joints)}
+
+
 def covariate_units(mechanism: Mechanism) -> dict[str, str]:
     """SI unit of every column that the library's effects know, or the machine itself takes, by name."""
     units = {c.name: c.unit for c in mechanism.takes} | {"time": "s", ROW: "1", "temperature": "K"}
-    units |= {f"load_{c.name}": "N" if c.unit == "m" else "N*m" for c in inside(mechanism).pose}
+    units |= {f"load_{c.name}": force_of(c.unit) for c in inside(mechanism).pose}
+    units |= {torque_of(j): force_of(j.unit) for j in mechanism.joints}
     units |= {f"direction{i + 1}": "1" for i in range(len(mechanism.joints))}
     return units | {f"speed{i + 1}": f"{j.unit}/s" for i, j in enumerate(mechanism.joints)}

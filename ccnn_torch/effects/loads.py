@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.columns import by_joint, inside, own_parameters, per_force
+from ccnn_torch.effects.columns import by_joint, force_of, inside, own_parameters, per_force, torque_of
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm, sees_directions
@@ -120,6 +120,39 @@ class Compliance(Effect):
         parts = [jacobian * (torque * ratio**k).unsqueeze(-2) for k in range(3)]
         arm = isinstance(situation.mechanism, SerialArm)
         return torch.cat([*parts, *_of_an_arm(situation)] if arm else [*parts, _stretching(situation)], -1)
+
+
+class Sag(Effect):
+    """Δq_i = c_i τ_i, τ = force or torque of each drive as measured at rest.
+
+    c is negative where the controller tells the torque with which a drive holds, and positive where it tells that of
+    the weight and load that it holds.
+    """
+
+    name = "sag"
+    kind = "joints"
+    description = "joints that give under their own torque, as measured at rest"
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """A torque that was measured."""
+        there = any(torque_of(j) in covariates for j in mechanism.joints)
+        one = mechanism.joints[0]
+        return "" if there else f"a column of the drives' torques: {torque_of(one)}[{force_of(one.unit)}]"
+
+    def _measured(self, situation: Situation) -> list[int]:
+        joints = situation.mechanism.joints
+        return [i for i, j in enumerate(joints) if torque_of(j) in situation.covariates]
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """One for each joint whose torque was measured."""
+        joints = [situation.mechanism.joints[i] for i in self._measured(situation)]
+        return tuple(Coefficient(j.name, per_force(j.unit), SCALE[j.unit], joint=j.name) for j in joints)
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x m`."""
+        joints, zero = situation.mechanism.joints, torch.zeros_like(situation.joints[..., 0])
+        torques = [situation.covariates.get(torque_of(j), zero).expand_as(zero) for j in joints]
+        return by_joint(torch.stack(torques, -1).unsqueeze(-1), self._measured(situation))
 
 
 def _stretching(situation: Situation) -> Tensor:
