@@ -126,13 +126,16 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
     here = analysis.situation
     mechanism, generator = here.mechanism, torch.Generator().manual_seed(seed)
     pose: Tensor | None = None
+    # Of frames by group those of the first row: the next rows are measured in that group.
+    parameters = here.parameters if here.parameters is None or here.parameters.dim() == 1 else here.parameters[0]
     if type(mechanism).sample_joints is not Mechanism.sample_joints:
         # Nothing tells what an arm may touch but where it has been; through its poses its joints would turn many times.
         low, high = here.joints.amin(0), here.joints.amax(0)
         joints = low + (high - low) * torch.rand(_CANDIDATES, len(low), generator=generator, dtype=low.dtype)
-    elif here.parameters is not None:
-        pose = mechanism.sample_workspace(_CANDIDATES, generator)
-        joints = mechanism.solve_inverse(pose, here.parameters)
+    elif parameters is not None:
+        # A machine that is framed has its workspace where its frames are.
+        pose = mechanism.with_nominal(parameters).sample_workspace(_CANDIDATES, generator)
+        joints = mechanism.solve_inverse(pose, parameters)
     else:
         joints = mechanism.sample_joints(_CANDIDATES, generator)
     drawn = {k: torch.randint(len(here.joints), (len(joints),), generator=generator) for k in (*_KINDS, "")}
@@ -142,8 +145,6 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
         order = torch.argsort(covariates["time"])
         covariates = {n: v[order] for n, v in covariates.items()}
         covariates["time"] = covariates["time"] + _APART * torch.arange(len(joints))
-    # Of frames by group those of the first row: the next rows are measured in that group.
-    parameters = here.parameters if here.parameters is None or here.parameters.dim() == 1 else here.parameters[0]
     return Situation(mechanism, joints, covariates, here.gravity, parameters, pose)
 
 

@@ -234,7 +234,7 @@ def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | 
             f"transfer: {mechanism.name} has no frame to be fitted anew; it takes a serial arm whose base_frame or "
             "tool_frame is unknown"
         )
-    if mechanism.frame_per or mechanism.tool_per:
+    if mechanism.grouped:
         raise InputError(
             "transfer: takes an arm with one frame for all rows; remove frame_per and tool_per, or transfer"
         )

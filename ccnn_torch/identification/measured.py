@@ -101,7 +101,7 @@ class Rows:
         return Rows(self.joints[machines], self.observed[machines])
 
     def in_set_ups(self, numbers: Tensor) -> Rows:
-        """The rows of an arm in set-ups, whose numbers `s` are the last of the joints (`SetUps`)."""
+        """The rows of a machine in set-ups, whose numbers `s` are the last of the joints (`SetUps`)."""
         return replace(self, joints=torch.cat([self.joints, numbers.to(self.joints.dtype)[None, :, None]], -1))
 
 
@@ -175,7 +175,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
     joint_noise = None
     if config.joint_noise is not None:
         joint_noise = sizes_of_joints(config.joint_noise, mechanism.joints, "joint_noise")
-    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+    if isinstance(mechanism, SerialArm | Framed) and mechanism.grouped:
         mechanism, number, groups = set_ups(mechanism, records.columns, len(records))
         _refuse_unseen(groups, split, records)
         train, test = (rows.in_set_ups(number[i]) for rows, i in ((train, split.train), (test, split.test)))
@@ -200,7 +200,7 @@ def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) ->
     """Records that fit a mechanism, and the mechanism as it was measured there (of its pose all, or a part)."""
     records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
-    if not config.frame.base and not config.frame.tool:
+    if not isinstance(mechanism, Framed) or not mechanism.unknown_frames:
         check_rows(records, mechanism)
         _check_joints(records, mechanism)
     return records, mechanism
@@ -235,10 +235,10 @@ def _start(mechanism: Mechanism, rows: Rows, columns: Mapping[str, NDArray[np.fl
     columns: of the rows, which number the groups.
     """
     joints, pose, fitted = rows.joints[0], rows.observed[0], None
-    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+    if isinstance(mechanism, SerialArm) and mechanism.grouped:
         fitted = fit_frames(mechanism, joints, pose, columns=columns)
-    elif not isinstance(mechanism, Framed):
-        fitted = fit_unknown(mechanism, joints, pose)
+    else:
+        fitted = fit_unknown(mechanism, joints, pose, columns=columns)
     return (mechanism.nominal if fitted is None else fitted)[None].clone()
 
 

@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis.joint_fit import effects_that_pay, fit_jointly, loose_
 from ccnn_torch.effects import make_effect
 from ccnn_torch.effects.time import FrameDrift
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm
+from ccnn_torch.mechanisms import BlackBox, Mechanism
 from ccnn_torch.records import Records
 
 # Rows that the search uses: more take longer and show the same.
@@ -45,7 +45,7 @@ def search_effects(
     """
     if isinstance(mechanism, BlackBox):
         return None, ["Effects were not searched: of a simulator every row takes long; see ccnn diagnose."]
-    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+    if mechanism.grouped:
         return None, ["Effects were not searched: one compensator needs one frame, and these rows have several."]
     if len(rows) > _MOST_ROWS:
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]

@@ -182,9 +182,12 @@ def forward_problem(
     turns = (rotation_vector_to_matrix(rows.pose[..., turning]).flatten(-2),) if turning else ()
     seen = None if bool(known.all()) else known[..., order].reshape(-1, rows.pose.shape[-2], len(order))
 
+    plain = mechanism.machine if isinstance(mechanism, SetUps) else mechanism
+
     def difference(full: Tensor, q: Tensor, x: Tensor, *measured: Tensor) -> Tensor:
         """In the order of `order`."""
-        if isinstance(mechanism, SerialArm | SetUps) and turning:
+        if isinstance(plain, SerialArm) and turning:
+            assert isinstance(mechanism, SerialArm | SetUps)
             position, rotation = mechanism.forward_frame(q, full)
         else:
             there = mechanism.forward_kinematics(q, full, x)
