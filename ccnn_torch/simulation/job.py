@@ -198,13 +198,11 @@ def simulate_records(
     generator = torch.Generator().manual_seed(seed)
     moving = config.rows == "trajectory" or (config.rows == "auto" and any(w.name == "latency" for w in wanted))
     joints, columns = (draw_moves if moving else draw_poses)(machine, rows, config, generator)
-    gravity = default_gravity(machine)
-    if config.gravity is not None:
-        gravity = torch.tensor(config.gravity, dtype=torch.float64)
+    down = default_gravity(machine) if config.gravity is None else torch.tensor(config.gravity, dtype=torch.float64)
     torques = any(w.name == Sag.name for w in wanted)
 
     def situation_at(joints: Tensor) -> Situation:
-        rows = Situation(machine, joints, columns, gravity)
+        rows = Situation(machine, joints, columns, down)
         return replace(rows, covariates=_kept(columns | (rest_torques(rows) if torques else {}), config.covariates))
 
     situation = situation_at(joints)

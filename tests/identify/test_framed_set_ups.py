@@ -155,6 +155,10 @@ def test_groups_of_a_frame_that_there_is_not_are_refused(tmp_path: Path) -> None
         load_mechanism("framed", mechanism="stewart", tool_per=["target"])
     with pytest.raises(InputError, match="frame_per must be a list of columns"):
         load_mechanism("framed", mechanism="stewart", frame_per="station")
+    with pytest.raises(InputError, match="frames per group of rows"):
+        load_mechanism(
+            "partial", mechanism="framed", keys={"mechanism": "stewart", "frame_per": ["station"]}, pose=["z"]
+        )
     _stewart(tmp_path, 4, 30)
     keys = {**STEWART, "records": str(tmp_path / "r.csv"), "save_report": False}
     keys["mechanism_keys"] = {"mechanism": "stewart", "frame_per": ["place"]}
