@@ -15,6 +15,8 @@ from ccnn_torch.diagnosis.residual.whitening import device_axes
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Situation
+from ccnn_torch.effects.columns import torque_of
+from ccnn_torch.effects.covariates import torques_elsewhere
 from ccnn_torch.evidence.dictionary import FittedSet, covariance
 from ccnn_torch.evidence.sets import scored
 from ccnn_torch.mechanisms import Mechanism
@@ -145,7 +147,9 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
         order = torch.argsort(covariates["time"])
         covariates = {n: v[order] for n, v in covariates.items()}
         covariates["time"] = covariates["time"] + _APART * torch.arange(len(joints))
-    return Situation(mechanism, joints, covariates, here.gravity, parameters, pose)
+    there = Situation(mechanism, joints, covariates, here.gravity, parameters, pose)
+    # A torque at rest is no choice, but what the joints and the load make it.
+    return replace(there, covariates=covariates | torques_elsewhere(here, there))
 
 
 def _columns(analysis: Analysis, found: FittedSet, there: Situation) -> Tensor:
@@ -196,11 +200,12 @@ def _chosen(situation: Situation, questions: list[_Question]) -> list[dict[str, 
         for question in questions:
             question.candidates.change(best, 1)
     assert alone is not None
+    left = {"time", *map(torque_of, mechanism.joints)}
     taken.sort(key=lambda pair: -float(alone[pair[1], pair[0]]))
     return [
         {
             "joints": {j.name: float(situation.joints[k, i]) for i, j in enumerate(mechanism.joints)},
-            "covariates": {n: float(v[k]) for n, v in situation.covariates.items() if n != "time"},
+            "covariates": {n: float(v[k]) for n, v in situation.covariates.items() if n not in left},
             "separates": questions[number].names,
             "gain": float(alone[number, k]),
         }

@@ -78,6 +78,24 @@ def rest_torques(situation: Situation) -> dict[str, Tensor]:
     return {torque_of(j): torques[..., i] for i, j in enumerate(situation.mechanism.joints)}
 
 
+def torques_elsewhere(rows: Situation, there: Situation) -> dict[str, Tensor]:
+    """The torques at rest that other rows of a machine have, `t` each, by name, as far as columns of rows `s` tell.
+
+    Each joint's by least squares: a constant, what its own weight, spread in two ways, and the load put on it.
+    """
+
+    def causes(at: Situation) -> Tensor:
+        parts = [torch.ones_like(at.joints), at.own_weight_torque, at.weight_torque, at.load_torque]
+        return torch.stack(parts, -1).movedim(-2, 0)
+
+    found, known, new = {}, causes(rows), causes(there)
+    for joint, here, other in zip(rows.mechanism.joints, known, new, strict=True):
+        if (name := torque_of(joint)) in rows.covariates:
+            shares = torch.linalg.lstsq(here, rows.covariates[name][:, None], driver="gelsd").solution
+            found[name] = (other @ shares)[:, 0]
+    return found
+
+
 def covariate_units(mechanism: Mechanism) -> dict[str, str]:
     """SI unit of every column that the library's effects know, or the machine itself takes, by name."""
     units = {c.name: c.unit for c in mechanism.takes} | {"time": "s", ROW: "1", "temperature": "K"}

@@ -101,6 +101,9 @@ def test_commands_hold_the_sag_that_the_torques_of_the_targets_tell(
     words = ("--records", tmp_path / "r.csv", "--mechanism", tmp_path / "arm.yaml", "--out", tmp_path / "d")
     code, told, error = cli("diagnose", *words, "--effects", "sag,gravity,joint_gain")
     assert code == 0 and "Compliance of joints 2 to" in told, error
+    # What a joint holds at rest is no choice of whoever measures next.
+    next_rows = (tmp_path / "d" / "next_measurements.csv").read_text()
+    assert "q6[deg]" in next_rows and "torque" not in next_rows
     draw, none = np.random.default_rng(9), np.zeros((4, 6))
     wanted = draw.uniform([-2, -2, 0.6, -2, -1.8, -2], [2, -0.8, 2, 0.2, -0.8, 2], (12, 6))
     torques = np.array([_held(q, 4.0, none) for q in wanted])
