@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import torque_of
 from ccnn_torch.diagnosis.candidates.atom import scaled_signature
 from ccnn_torch.diagnosis.residual.rows import frame_columns, in_groups
 from ccnn_torch.diagnosis.residual.whitening import device_axes
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Situation
-from ccnn_torch.effects.columns import torque_of
 from ccnn_torch.effects.covariates import torques_elsewhere
 from ccnn_torch.evidence.dictionary import FittedSet, covariance
 from ccnn_torch.evidence.sets import scored

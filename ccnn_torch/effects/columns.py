@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, Seen, SerialArm
 from ccnn_torch.numerics.rotations import skew
@@ -45,21 +44,6 @@ def one_by_one(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
 def of_rows(values: Tensor, rows: Tensor | None, dim: int = -2) -> Tensor:
     """Some of the rows, which count along `dim`; all where rows is None."""
     return values if rows is None else values.index_select(dim, rows)
-
-
-def torque_of(joint: Coordinate) -> str:
-    """The column of a drive's force or torque at rest."""
-    return f"torque_{joint.name}"
-
-
-def force_of(unit: str) -> str:
-    """Unit of the force or moment along a coordinate of this unit."""
-    return "N" if unit == "m" else "N*m"
-
-
-def per_force(unit: str) -> str:
-    """Unit of a compliance of a joint of this unit."""
-    return f"{unit}/{'N' if unit == 'm' else 'N/m'}"
 
 
 def inside(mechanism: Mechanism) -> Mechanism:

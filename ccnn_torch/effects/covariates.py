@@ -8,7 +8,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.columns import force_of, inside, torque_of
+from ccnn_torch.coordinates import force_of, torque_of
+from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.effects.time import REFERENCE, ROW
 from ccnn_torch.mechanisms import Mechanism

@@ -251,7 +251,8 @@ def transferred(config: IdentifyConfig, elsewhere: Elsewhere, values: Tensor) ->
     """
     train, test = elsewhere.train, elsewhere.test
     errors = []
-    for nominal in (elsewhere.arm.nominal, values):
+    # What joints give under torques is no part of an arm.
+    for nominal in (elsewhere.arm.nominal, values[: len(elsewhere.arm.nominal)]):
         arm = elsewhere.arm.with_nominal(nominal)
         assert isinstance(arm, SerialArm)
         placed = fit_frames(arm, train.joints[0], train.observed[0], rotation_weight=config.rotation_weight)

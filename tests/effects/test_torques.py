@@ -11,6 +11,7 @@ from arm_text import ALPHA, A, D, arm_text
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ccnn_torch.api import identify
 from ccnn_torch.diagnosis import diagnose
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
@@ -92,6 +93,25 @@ def test_what_each_joint_gives_for_its_measured_torque_is_told(geometry: float, 
         block = found[f"q{joint}"]
         # The records have the torque with which a drive holds: the joint gives the other way.
         assert abs(block["value"] + gives) < 4 * block["sd"] + 0.02 * gives and block["sd"] < 0.1 * gives
+
+
+def test_identify_does_not_bend_the_geometry_to_what_joints_give(tmp_path: Path) -> None:
+    errors = _measured(tmp_path, 100, 1.0)
+    noise = {**dict.fromkeys("xyz", NOISE), **dict.fromkeys(("rx", "ry", "rz"), TURN_NOISE)}
+    keys = {"mechanism": str(tmp_path / "arm.yaml"), "noise": noise, "save_report": False}
+    found = identify(records=str(tmp_path / "r.csv"), **keys)
+    told = found.results["parameters"]
+    for joint, gives in zip((2, 3, 4, 5), GIVES[1:], strict=False):
+        block = told[f"compliance q{joint}"]
+        assert abs(block["value"] + gives) < 4 * block["sd"] + 0.02 * gives and block["unit"] == "rad/N/m"
+    names = [f"{name}{j}" for name, j in (("a", 2), ("a", 3), ("alpha", 1), ("alpha", 2), ("theta", 3), ("theta", 5))]
+    rows = {"theta": 0, "d": 1, "a": 2, "alpha": 3}
+    right = np.array([errors[rows[name[:-1]], int(name[-1]) - 1] for name in names])
+    off = [told[n]["value"] - told[n]["nominal"] - e for n, e in zip(names, right, strict=True)]
+    assert np.all(np.abs(off) < 4.5 * np.array([told[n]["sd"] for n in names]))
+    assert found.results["test"]["position"]["after"] < 1.5 * np.sqrt(3) * NOISE
+    # What is written is the arm alone, whose commands know no torque.
+    assert "compliance q2" not in [p.name for p in found.mechanism().geometry] and found.results["promise"] is None
 
 
 def test_commands_hold_the_sag_that_the_torques_of_the_targets_tell(
