@@ -164,3 +164,22 @@ def test_groups_of_a_frame_that_there_is_not_are_refused(tmp_path: Path) -> None
     keys["mechanism_keys"] = {"mechanism": "stewart", "frame_per": ["place"]}
     with pytest.raises(InputError, match="frame_per names the column 'place', which the records lack"):
         ccnn_torch.identify(**keys)
+
+
+def test_a_gantry_of_a_machine_file_is_measured_from_two_stations(tmp_path: Path) -> None:
+    draw, askew = np.random.default_rng(6), 4e-4
+    joints, station = draw.uniform(0, [0.5, 0.4, 0.2], (80, 3)), draw.integers(0, 2, 80)
+    places = joints + askew * joints[:, [1]] * [1, 0, 0]
+    seen = np.array([Rotation.from_rotvec(STATIONS[s, 3:]).apply(p) for s, p in zip(station, places, strict=True)])
+    seen += STATIONS[station, :3] + draw.normal(0, NOISE, (80, 3))
+    lines = np.c_[joints, seen, station + 1].tolist()
+    _write(tmp_path / "r.csv", lines, ["q1[m]", "q2[m]", "q3[m]", "x[m]", "y[m]", "z[m]", "station[1]"])
+    file = tmp_path / "gantry.yaml"
+    file.write_text("machine: gantry\nbase_frame: unknown\nframe_per: [station]\n")
+    found = ccnn_torch.identify(mechanism=str(file), records=str(tmp_path / "r.csv"), save_report=False).results
+    assert abs(abs(found["parameters"]["squareness_xy"]["value"]) / askew - 1) < 0.05
+    assert "base_x station 2" in found["parameters"]
+    assert found["test"]["position"]["after"] < 1.5 * np.sqrt(3) * NOISE < 3e-5 < found["test"]["position"]["before"]
+    file.write_text("machine: gantry\nframe_per: station\n")
+    with pytest.raises(InputError, match="frame_per: must be a list of columns"):
+        load_mechanism(str(file))
