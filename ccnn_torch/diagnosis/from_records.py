@@ -37,6 +37,7 @@ from ccnn_torch.effects.time import ROW, FrameDrift, elapsed
 from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import (
     BlackBox,
+    Framed,
     Instrument,
     Mechanism,
     SerialArm,
@@ -118,7 +119,7 @@ def _mounts(records: Records, situation: Situation) -> dict[str, Tensor]:
 
 def _word(situation: Situation) -> str:
     """What a group of rows is called."""
-    return next(iter(getattr(situation.mechanism, "frame_per", ())), "")
+    return next(iter(situation.mechanism.frame_per), "")
 
 
 def _instrument(records: Records, situation: Situation) -> Noise | None:
@@ -130,7 +131,7 @@ def _unread(records: Records, situation: Situation, said: Diagnosis) -> list[str
     """A note of columns that no effect uses: one of them may be misnamed."""
     mechanism = situation.mechanism
     known = [*DEFAULT_COVARIATES, *situation.covariates, *(condition.name for condition in mechanism.takes)]
-    known += [*mechanism.frame_per, *mechanism.tool_per] if isinstance(mechanism, SerialArm) else []
+    known += [*mechanism.frame_per, *mechanism.tool_per]
     known += [FILE] if records.parts else []
     known += [name for c in mechanism.pose for name in column_names(c.name)] if said.noise == "columns" else []
     names = [name for name in records.columns if not any(fnmatchcase(name, pattern) for pattern in known)]
@@ -315,12 +316,17 @@ def _in_link_frames(situation: Situation) -> Situation:
 
 
 def _in_own_base(situation: Situation, values: Tensor) -> tuple[Situation, Tensor]:
-    """An arm of which groups of rows have base frames, without these, and its parameters so; values: in one group."""
-    arm, parameters = situation.mechanism, situation.parameters
-    assert isinstance(arm, SerialArm) and parameters is not None
-    plain: dict[str, Any] = {"frame_per": [], "tool_per": [], "unknown_frames": [], "tool_offset": None}
+    """A machine of which groups of rows have base frames, without these, and its parameters so; values: of one."""
+    machine, parameters = situation.mechanism, situation.parameters
+    assert parameters is not None
     none = torch.zeros(6, dtype=values.dtype)
-    alone = SerialArm(**{**arm.recipe["keys"], **plain}).with_nominal(torch.cat([none, parameters[0, 6:]]))
+    if isinstance(machine, SerialArm):
+        plain: dict[str, Any] = {"frame_per": [], "tool_per": [], "unknown_frames": [], "tool_offset": None}
+        one: Mechanism = SerialArm(**{**machine.recipe["keys"], **plain})
+    else:
+        assert isinstance(machine, Framed)
+        one = Framed(machine.mechanism, True, machine.tool, machine.rotation_weight)
+    alone = one.with_nominal(torch.cat([none, parameters[0, 6:]]))
     down = rotation_vector_to_matrix(parameters[0, 3:6]).mT @ situation.gravity
     return replace(situation, mechanism=alone, parameters=None, gravity=down), torch.cat([none, values[6:]])
 

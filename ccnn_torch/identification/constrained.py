@@ -374,17 +374,18 @@ def identify_by_constraint(
 def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
     """The mechanism; of an arm one without frames per group, since the constraint has its own."""
     mechanism = nominal_machine(config)
+    assert config.constraint is not None
+    kinds = {config.constraint.kind, *(one.kind for one in config.constraint.beside)}
+    ignored = [key for key in ("frame_per", "tool_per") if getattr(mechanism, key)]
+    if ignored and ("pose" in kinds or not isinstance(mechanism, SerialArm)):
+        raise InputError(
+            f"{config.mechanism}: {ignored[0]}: poses beside a constraint are in the machine's own base; remove the "
+            "key and give poses in that base, or remove constraint to identify from poses of several set-ups"
+        )
     if not isinstance(mechanism, SerialArm):
         return (Framed(mechanism, base=False, tool=True) if config.frame.tool else mechanism), []
     if config.frame.tool:
         raise InputError("frame.tool: an arm has a tool offset of its own, which is identified anyway; remove the key")
-    ignored = [key for key in ("frame_per", "tool_per") if getattr(mechanism, key)]
-    assert config.constraint is not None
-    if ignored and "pose" in (config.constraint.kind, *(one.kind for one in config.constraint.beside)):
-        raise InputError(
-            f"{config.mechanism}: {ignored[0]}: poses beside a constraint are in the arm's own base; remove the "
-            "key and give poses in that base, or remove constraint to identify from poses of several set-ups"
-        )
     plain = mechanism.with_orientation("none")
     arm = SerialArm(**{**plain.recipe["keys"], "unknown_frames": [], "frame_per": [], "tool_per": []})
     said = f"{' and '.join(ignored)} of the mechanism count for nothing here: the constraint has its own placements."

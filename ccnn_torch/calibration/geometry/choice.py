@@ -18,7 +18,7 @@ from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import make_learner
 from ccnn_torch.learners.gp import GPSettings
-from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import joint_deviations
@@ -110,7 +110,7 @@ def choose_model(
     geometry_why = ""
     if geometry != "none" and not mechanism.geometry:
         geometry_why = f"{name} has no geometric parameters to identify."
-    elif geometry != "none" and isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+    elif geometry != "none" and mechanism.grouped:
         geometry_why = f"{name} has frames per group of rows, and identified geometry has one."
     if geometry_why and geometry == "identify":
         # It is refused where it is fitted, with what to do.

@@ -347,7 +347,10 @@ def joint_scatter(analysis: Analysis, judgement: Judgement) -> Scatter | None:
 # Log odds that an effect must gain by a correction, over all that was found without it: mistakes are rare.
 _GAIN = 10.0
 # Effects that need columns, by how these begin.
-_USED_BY = {"load_": ("compliance", "friction"), "direction": ("backlash", "friction"), "temperature": ("thermal",)}
+_USED_BY = {
+    **{"load_": ("compliance", "friction"), "torque_": ("sag",), "direction": ("backlash", "friction")},
+    "temperature": ("thermal",),
+}
 
 
 def column_mistake(analysis: Analysis) -> str:

@@ -192,9 +192,9 @@ def _swapped(values: Tensor, i: int, k: int) -> Tensor:
 def placed(situation: Situation, measured: Tensor) -> Situation:
     """The rows with unknown frames fitted to these poses; as they are where no frame is unknown, or one per group."""
     mechanism, parameters = situation.mechanism, None
-    if isinstance(mechanism, Framed) and mechanism.unknown_frames:
+    if isinstance(mechanism, Framed) and mechanism.unknown_frames and not mechanism.grouped:
         parameters = mechanism.inlying_frames(situation.joints, measured)
-    elif isinstance(mechanism, SerialArm) and mechanism.unknown_frames and not _grouped(mechanism):
+    elif isinstance(mechanism, SerialArm) and mechanism.unknown_frames and not mechanism.grouped:
         parameters = _closed_form(mechanism, situation.joints, measured)
     return situation if parameters is None else replace(situation, parameters=parameters)
 
@@ -235,7 +235,7 @@ def frame_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
 def tool_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
     """What to write where the measured point is elsewhere on the flange of an arm than its file says; else empty."""
     arm, finite = situation.mechanism, torch.isfinite(measured).all(-1)
-    if not isinstance(arm, SerialArm) or "tool" in arm.unknown_frames or _grouped(arm):
+    if not isinstance(arm, SerialArm) or "tool" in arm.unknown_frames or arm.grouped:
         return ""
     joints, measured = situation.joints[finite], measured[finite]
     if len(joints) < _FEWEST_LATE:
@@ -254,10 +254,6 @@ def tool_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
         f"the measured point seems to be at {there} mm from the flange and not at {own} mm, which leaves "
         f"{1e3 * left:.3g} mm; correct tool_offset in its file, or write tool_offset: unknown to have it fitted"
     )
-
-
-def _grouped(arm: SerialArm) -> bool:
-    return bool(arm.frame_per or arm.tool_per)
 
 
 def _closed_form(arm: SerialArm, joints: Tensor, measured: Tensor) -> Tensor:

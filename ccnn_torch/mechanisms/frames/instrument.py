@@ -15,6 +15,7 @@ from ccnn_torch.mechanisms.frames.fit import fit_frames
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.frames.partial import Seen
 from ccnn_torch.mechanisms.frames.readings import Place, Reading, make_reading
+from ccnn_torch.mechanisms.frames.set_ups import fit_set_ups
 from ccnn_torch.mechanisms.machines.links import compose
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
@@ -206,6 +207,8 @@ def fit_unknown(
     if isinstance(mechanism, SerialArm):
         return fit_frames(mechanism, joints, pose, weights, columns=columns)
     if isinstance(mechanism, Framed):
+        if mechanism.grouped:
+            return fit_set_ups(mechanism, joints, pose, weights, columns)
         return mechanism.inlying_frames(joints, pose, weights)
     assert isinstance(mechanism, Instrument)
     return mechanism.fitted(joints, pose, weights)
