@@ -1,0 +1,51 @@
+"""Public repairs replayed: what the diagnosis says, and what its numbers are worth when they are typed in."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ccnn_validation.repairs.__main__ import HEADER, line
+from ccnn_validation.repairs.arms import REPAIRS, chain_of, numbers
+from ccnn_validation.repairs.replay import KEPT, read, replayed, typed_in
+
+BY_NAME = {repair.name: repair for repair in REPAIRS}
+TABLE = Path(__file__).parents[2] / "docs" / "results" / "repairs.csv"
+
+
+def test_a_repair_by_parallel_axes_is_typed_in(tmp_path):
+    """The UR10's d4 is off by 8.9 mm, which four shifts along parallel axes can mend: one of them is told."""
+    found = replayed(BY_NAME["Universal Robots UR10"], tmp_path)
+    assert found.content["verdict"]["effects"] == ["geometry"]
+    assert found.before > 10 and found.typed < 0.03 and found.kept < KEPT
+    assert found.outcome == "same motion" and len(found.shown) == 4
+    told = {row[0]: read(row[-1]) for row in found.shown}
+    assert told["link 3 z3"] == pytest.approx(612.0, abs=0.03) and told["link 4 z4"] == pytest.approx(572.3, abs=0.03)
+
+
+def test_a_joint_that_turns_the_other_way_is_told(tmp_path):
+    found = replayed(BY_NAME["Fanuc LR Mate 200iD"], tmp_path)
+    assert found.outcome == "told" and line(found)[3] == "refused"
+
+
+def test_what_is_shown_is_typed_in_digit_by_digit():
+    shown = [
+        ("link 3 z3", "19.99 mm", "± 16 µm", "204.4905 mm"),
+        ("geometry error, link 5 pitch5", "0.1 rad", "± 1 mrad", "0.1309 rad = 7.500°"),
+        ("zero offset, joint 2", "-2.00 mrad", "± 9 µrad", "–"),
+    ]
+    old = numbers(BY_NAME["KUKA LBR iiwa 14 R820"], False)
+    chain, offsets = typed_in(old, shown)
+    wanted = old.copy()
+    wanted[2, 2], wanted[4, 4] = 204.4905, 7.5
+    assert np.allclose(chain.origins[2][0], chain_of(wanted).origins[2][0], atol=0)
+    assert np.allclose(chain.origins[4][1], chain_of(wanted).origins[4][1], atol=0)
+    assert offsets.tolist() == pytest.approx([0, -2e-3, 0, 0, 0, 0, 0])
+
+
+def test_the_table_has_every_repair():
+    with open(TABLE, encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    assert tuple(header) == HEADER
+    assert [row[0] for row in rows] == [f"{r.name}, {r.source}" for r in REPAIRS]
+    assert all(len(row) == len(HEADER) for row in rows)
