@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 # Squares that are not seen in all rows together, in noise variances.
-_UNSEEN = 1.0
+_UNSEEN = 0.1
 # Share by which the gains of numbers that do the same may differ.
 _TIE = 1e-6
 
