@@ -24,7 +24,6 @@ class Repair:
         found: what people said was wrong.
         old: `COLUMNS` of each joint, one line a joint, and x y z roll pitch yaw of the flange as the last line.
         new: numbers after the repair, by joint (from 1; the flange comes last) and column.
-        told: what the sentence of a refusal has to say, where the model is too far off to be diagnosed.
     """
 
     name: str
@@ -32,7 +31,6 @@ class Repair:
     found: str
     old: str
     new: dict[tuple[int, str], float]
-    told: str = ""
 
 
 def numbers(repair: Repair, repaired: bool) -> Array:
@@ -119,7 +117,6 @@ REPAIRS = (
         0 0 0  180 -90 0
         """,
         {(6, "axis_x"): -1.0},
-        "joint q6 seems to count in the other direction",
     ),
     Repair(
         "Motoman MH5",

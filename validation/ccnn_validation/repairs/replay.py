@@ -72,9 +72,9 @@ class Replay:
 
     @property
     def outcome(self) -> str:
-        """`same numbers` that people changed, `same motion` by other numbers, `in the frames`, `told`, or `no`."""
+        """`same numbers` as people changed, `same motion` by others, `in the frames`, `told` by a refusal, or `no`."""
         if self.refused:
-            return "told" if self.repair.told and self.repair.told in self.said else "no"
+            return "told" if 1e-3 * self.typed < _VISIBLE else "no"
         if 1e-3 * self.before < _VISIBLE:
             return "in the frames" if self.content["verdict"]["none"] else "no"
         if not self.kept <= KEPT:
@@ -92,7 +92,7 @@ def replayed(repair: Repair, folder: Path, seed: int = 0) -> Replay:
     """
     rng = np.random.default_rng(seed)
     old, truth = numbers(repair, False), chain_of(numbers(repair, True))
-    found, still = Replay(repair), np.zeros(len(old) - 1)
+    found = Replay(repair)
     joints, fresh = drawn_joints(old, ROWS, rng), drawn_joints(old, NEW_ROWS, rng)
     rows, noisy, clean = measured(truth, joints, rng), measured(truth, fresh, rng), measured(truth, fresh, None)
     model, records = folder / "arm.urdf", folder / "rows.csv"
@@ -101,17 +101,19 @@ def replayed(repair: Repair, folder: Path, seed: int = 0) -> Replay:
         # A pitch of 90° leaves roll and yaw free.
         warnings.simplefilter("ignore", UserWarning)
         model.write_text(urdf_text("arm", chain_of(old), low, high))
-    names = [f"q{i + 1}[rad]" for i in range(len(still))]
+    names = [f"q{i + 1}[rad]" for i in range(len(low))]
     header = ",".join([*names, *(f"{n}[m]" for n in "xyz"), *(f"r{n}[rad]" for n in "xyz")])
     table = np.c_[joints, rows[1], Rotation.from_matrix(rows[2]).as_rotvec()]
     np.savetxt(records, table, "%.9f", ",", header=header, comments="")
-    found.before = median(chain_of(old), still, clean)
+    found.before = median(chain_of(old), clean)
     noise = dict.fromkeys(("x", "y", "z"), LENGTH_NOISE) | dict.fromkeys(("rx", "ry", "rz"), ANGLE_NOISE)
     mechanism, start = load_mechanism(str(model)), time.perf_counter()
     try:
         said = diagnose(load_records(records, mechanism), mechanism, noise=noise, seed=seed)
     except InputError as error:
         found.said, found.refused = str(error).removeprefix(f"{records}: "), True
+        signs, offsets = counted(found.said, len(low))
+        found.typed = median(chain_of(old), (signs * fresh + offsets, *clean[1:]))
         return found
     finally:
         found.seconds = time.perf_counter() - start
@@ -120,8 +122,9 @@ def replayed(repair: Repair, folder: Path, seed: int = 0) -> Replay:
     found.said = screen[0].text
     found.shown = [tuple(row) for answer in screen if answer.table is not None for row in answer.table.rows]
     chain, offsets = typed_in(old, found.shown)
-    found.typed = median(chain, offsets, clean)
-    gone = errors(chain, offsets, noisy, frames(chain, offsets, rows))
+    found.typed = median(chain, (fresh + offsets, *clean[1:]))
+    fitted = frames(chain, (joints + offsets, *rows[1:]))
+    gone = errors(chain, (fresh + offsets, *noisy[1:]), fitted)
     found.kept = float(np.sqrt((gone**2).sum(1).mean()) / found.content["gap"]["after"])
     return found
 
@@ -146,28 +149,37 @@ def measured(chain: Chain, joints: Array, rng: np.random.Generator | None) -> Po
     return joints, position + rng.normal(0, LENGTH_NOISE, position.shape), turn @ rotation
 
 
-def errors(chain: Chain, offsets: Array, rows: Poses, fitted: Array) -> Array:
-    """Position errors of a model with offsets of its joints [rad], in a base and a tool frame `12`; `s x 3` [m]."""
-    return np.asarray(rows[1] - chain_pose(chain, rows[0] + offsets, fitted[:6], fitted[6:])[0])
+def errors(chain: Chain, rows: Poses, fitted: Array) -> Array:
+    """Position errors of a model in a base and a tool frame `12`; `s x 3` [m]."""
+    return np.asarray(rows[1] - chain_pose(chain, rows[0], fitted[:6], fitted[6:])[0])
 
 
-def frames(chain: Chain, offsets: Array, rows: Poses) -> Array:
+def frames(chain: Chain, rows: Poses) -> Array:
     """Base and tool frame in which a model fits rows best, `12`."""
 
     def left(values: Array) -> Array:
-        position, rotation = chain_pose(chain, rows[0] + offsets, values[:6], values[6:])
-        turn = difference(rotation, rows[2]) / ANGLE_NOISE
-        whole: Array = np.r_[((rows[1] - position) / LENGTH_NOISE).ravel(), turn.ravel()]
+        turn = difference(chain_pose(chain, rows[0], values[:6], values[6:])[1], rows[2]) / ANGLE_NOISE
+        whole: Array = np.r_[(errors(chain, rows, values) / LENGTH_NOISE).ravel(), turn.ravel()]
         return whole
 
     found: Array = least_squares(left, np.r_[BASE, _FRAME], x_scale="jac").x
     return found
 
 
-def median(chain: Chain, offsets: Array, rows: Poses) -> float:
+def median(chain: Chain, rows: Poses) -> float:
     """Median position error in frames fitted to the same rows [mm]."""
-    gone = errors(chain, offsets, rows, frames(chain, offsets, rows))
-    return float(1e3 * np.median(np.linalg.norm(gone, axis=1)))
+    return float(1e3 * np.median(np.linalg.norm(errors(chain, rows, frames(chain, rows)), axis=1)))
+
+
+def counted(said: str, joints: int) -> tuple[Array, Array]:
+    """Sign and offset [rad] of each joint, as a refusal tells them."""
+    signs, offsets = np.ones(joints), np.zeros(joints)
+    for joint, sign, offset, angle in re.findall(r'q(\d+): "(-?)q\d+(?: ([+-]) ([\d.]+) deg)?"', said):
+        signs[int(joint) - 1] = -1.0 if sign else 1.0
+        offsets[int(joint) - 1] = np.radians(float(offset + angle)) if angle else 0.0
+    if alone := re.search(r"joint q(\d+) seems to count in the other direction", said):
+        signs[int(alone[1]) - 1] = -1.0
+    return signs, offsets
 
 
 def typed_in(table: Array, shown: Sequence[tuple[str, ...]]) -> tuple[Chain, Array]:
