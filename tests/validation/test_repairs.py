@@ -1,6 +1,7 @@
 """Public repairs replayed: what the diagnosis says, and what its numbers are worth when they are typed in."""
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,14 @@ def test_a_repair_by_parallel_axes_is_typed_in(tmp_path):
 def test_a_joint_that_turns_the_other_way_is_told(tmp_path):
     found = replayed(BY_NAME["Fanuc LR Mate 200iD"], tmp_path)
     assert found.outcome == "told" and line(found)[3] == "refused"
+
+
+def test_what_the_fitted_tool_took_is_told(tmp_path):
+    """35.5 mm along the last axis are a longer tool: nothing is wrong that could be named, and they are told."""
+    found = replayed(BY_NAME["Motoman MH5"], tmp_path)
+    assert found.outcome == "in the frames" and found.said.startswith("Nothing")
+    assert found.content["frames"]["tool"] == pytest.approx([0.0355, 0, 0, 0, 0, 0], abs=1e-4)
+    assert re.search(r"tool \(35\.\d\d, -?0\.0\d, -?0\.0\d\) mm", found.frames)
 
 
 def test_what_is_shown_is_typed_in_digit_by_digit():

@@ -54,6 +54,8 @@ def first_screen(results: Block, about: About, most: int = ON_PAGE) -> list[Answ
         said.append(Answer("What it removes", removed))
     if look := " ".join(f.look for f in findings(results)):
         said.append(Answer("Look at", look, table=numbers_table(results, most)))
+    if results.get("frames"):
+        said.append(Answer("Fitted frames", _frames(results["frames"])))
     if about.compensate:
         said.append(Answer("Compensate", about.compensate[0], tuple(about.compensate[1:])))
     if measure := _measure(results, about):
@@ -105,6 +107,16 @@ def _removed(results: Block) -> str:
     if network.get("gap_after") is not None and network["gain_ci95"][0] > 0:
         floor += f"; with a network on the rest {size_text(network['gap_after'], network)}"
     return f"{text}{floor}."
+
+
+def _frames(frames: Mapping[str, Any]) -> str:
+    """What was fitted before anything was named, and what it may hide."""
+    told = []
+    for name, (x, y, z, *turn) in frames.items():
+        shift = ", ".join(f"{1e3 * v:.2f}" for v in (x, y, z))
+        told.append(f"{name} ({shift}) mm and {math.degrees(math.hypot(*turn)):.3f}° from the model's")
+    hidden = " or ".join({"base": "the first link's place", "tool": "the flange"}[name] for name in frames)
+    return f"{capital('; '.join(told))}. An error of {hidden} is in these, and in no number above."
 
 
 def _measure(results: Block, about: About) -> str:

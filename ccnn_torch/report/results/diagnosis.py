@@ -241,5 +241,8 @@ class DiagnosisResults(Result):
     cautions: list[str]
     """signs that records and model do not fit each other, one sentence each; they stand in verdict.text as well"""
     notes: list[str]
+    frames: dict[str, list[float]] = {}
+    """how far an arm's base and tool, where they were fitted, are from the model's with the verdict's numbers in it:
+    shift [m] and rotation vector [rad], in the frame before. Errors of link 1's place and of the flange hide in them"""
     machine: FoundMachine | None = None
     """the machine with these effects, fitted together to all rows, as a compensator takes it"""

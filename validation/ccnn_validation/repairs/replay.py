@@ -58,6 +58,7 @@ class Replay:
             the screen shows typed in.
         kept: RMS position error of new measured poses after typing, over what the verdict promises.
         seconds: of the diagnosis.
+        frames: what the screen says of the fitted base and tool.
     """
 
     repair: Repair
@@ -69,6 +70,7 @@ class Replay:
     typed: float = float("nan")
     kept: float = float("nan")
     seconds: float = 0.0
+    frames: str = ""
 
     @property
     def outcome(self) -> str:
@@ -120,6 +122,7 @@ def replayed(repair: Repair, folder: Path, seed: int = 0) -> Replay:
     found.content = dict(said.to_json())
     screen = first_screen(found.content, About(), ON_SCREEN)
     found.said = screen[0].text
+    found.frames = next((answer.text for answer in screen if answer.label == "Fitted frames"), "")
     found.shown = [tuple(row) for answer in screen if answer.table is not None for row in answer.table.rows]
     chain, offsets = typed_in(old, found.shown)
     found.typed = median(chain, (fresh + offsets, *clean[1:]))
