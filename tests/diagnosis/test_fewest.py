@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ccnn_torch.diagnosis.verdict.fewest import fewest
+from ccnn_torch.diagnosis.verdict.fewest import fewest, together
 
 
 def test_an_error_is_in_one_of_the_numbers_that_do_the_same():
@@ -33,3 +33,12 @@ def test_numbers_that_cannot_be_told_apart_are_left_as_fitted():
     mean = torch.full((3,), 900.0, dtype=torch.float64)
     values, errors = fewest(columns.mT @ columns, mean, torch.eye(3, dtype=torch.float64), 0.5)
     assert values.equal(mean) and errors.tolist() == [1.0] * 3
+
+
+def test_numbers_have_to_be_entered_together_until_they_leave_what_is_promised():
+    gram = torch.eye(4, dtype=torch.float64)
+    mean = torch.tensor([1.0, -4.0, 3.0, 0.1], dtype=torch.float64)
+    deviation = torch.full((4,), 0.05, dtype=torch.float64)
+    # Entered one after the other the clearest leave squares of 10.01, 1.01, 0.01 and 0 beside those of all of them.
+    for left, count in ((100.0, 0), (23.0, 1), (2.3, 2), (1.0, 3), (0.02, 4)):
+        assert together(gram, mean, deviation, left) == count

@@ -261,15 +261,18 @@ def numbers_table(results: Block, most: int) -> Table | None:
     """
     rows, notes, left_out = [], [], 0
     by_name, chosen = {e["name"]: e for e in results["effects"]}, results["verdict"]["effects"]
-    each = max(most // max(len(chosen), 1), _FEWEST)
     for effect in chosen:
         parameters = by_name.get(effect, {}).get("parameters", {})
         clear = clear_parameters(parameters)
+        needed = max((block.get("together", 1) for block in clear.values()), default=0)
+        each = max(most // max(len(chosen), 1), _FEWEST, min(needed, ON_PAGE))
+        repairs = needed <= min(each, len(clear))
+        notes += [] if repairs else ["What is shown does not repair the model: enter all numbers together."]
         for name in list(clear)[:each]:
             block = parameters[name]
             value, error = block["value"], _Z95 * block["sd"]
             part = block.get("part") or ""
-            enter = "–" if block.get("nominal") is None else _whole(block, block["nominal"] + value)
+            enter = "–" if block.get("nominal") is None or not repairs else _whole(block, block["nominal"] + value)
             text = f"{block.get('word') or _named(name, part)}{_often(name, parameters)}{_counted(block)}"
             text = text if len(chosen) == 1 else f"{words_of(effect).short}, {text}"
             rows.append((text, told_words(block, value, 4), f"± {told_words(block, error, 2, value)}", enter))

@@ -7,6 +7,8 @@ from torch import Tensor
 
 # Squares that are not seen in all rows together, in noise variances.
 _UNSEEN = 0.1
+# Times what a verdict leaves that a part of its numbers may leave.
+_KEPT = 1.2
 # Share by which the gains of numbers that do the same may differ.
 _TIE = 1e-6
 
@@ -55,3 +57,19 @@ def fewest(gram: Tensor, mean: Tensor, spread: Tensor, noise: float) -> tuple[Te
     inner, cross = spread[~chosen][:, ~chosen], spread[~chosen]
     known = spread.diagonal() - (cross * torch.linalg.solve(inner, cross)).sum(0)
     return found, torch.where(chosen, known.clamp_min(0).sqrt(), deviation)
+
+
+def together(gram: Tensor, mean: Tensor, deviation: Tensor, left: float) -> int:
+    """How many of the clearest numbers have to be entered together to leave no more than 1.2 times what all leave.
+
+    Args:
+        gram, mean: as for `fewest`.
+        deviation: standard deviations, `m`, which say which numbers are the clearest.
+        left: squares that all of them leave.
+    """
+    gone = mean.clone()
+    for count, i in enumerate((mean.abs() / deviation).argsort(descending=True).tolist()):
+        if float(gone @ gram @ gone) <= (_KEPT**2 - 1) * left:
+            return count
+        gone[i] = 0.0
+    return len(mean)

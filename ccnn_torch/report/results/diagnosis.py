@@ -75,6 +75,9 @@ class Coefficient(Result):
     """the one joint, leg or link that it belongs to"""
     nominal: Number = None
     """what the model has, of a parameter of the mechanism; the value is the difference to it"""
+    together: int = 1
+    """of a parameter of the mechanism: how many of its effect's clearest numbers, entered together, leave no more than
+    1.2 times what is promised"""
     sense: str = ""
     """which way it counts, where that is not the usual one"""
     word: str = ""
