@@ -265,8 +265,8 @@ def numbers_table(results: Block, most: int) -> Table | None:
         parameters = by_name.get(effect, {}).get("parameters", {})
         clear = clear_parameters(parameters)
         needed = max((block.get("together", 1) for block in clear.values()), default=0)
-        each = max(most // max(len(chosen), 1), _FEWEST, min(needed, ON_PAGE))
-        repairs = needed <= min(each, len(clear))
+        repairs = needed <= min(ON_PAGE, len(clear))
+        each = max(most // max(len(chosen), 1), _FEWEST, needed if repairs else 0)
         notes += [] if repairs else ["What is shown does not repair the model: enter all numbers together."]
         for name in list(clear)[:each]:
             block = parameters[name]
