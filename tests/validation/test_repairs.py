@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from ccnn_validation.repairs.__main__ import HEADER, line
 from ccnn_validation.repairs.arms import REPAIRS, chain_of, numbers
+from ccnn_validation.repairs.motion import HELD_OUT, MOTION_REPAIRS, run, typed_in as axis_with
 from ccnn_validation.repairs.replay import KEPT, read, replayed, typed_in
 
 BY_NAME = {repair.name: repair for repair in REPAIRS}
-TABLE = Path(__file__).parents[2] / "docs" / "results" / "repairs.csv"
+TABLES = Path(__file__).parents[2] / "docs" / "results"
 
 
 def test_a_repair_by_parallel_axes_is_typed_in(tmp_path):
@@ -52,9 +53,21 @@ def test_what_is_shown_is_typed_in_digit_by_digit():
     assert offsets.tolist() == pytest.approx([0, -2e-3, 0, 0, 0, 0, 0])
 
 
-def test_the_table_has_every_repair():
-    with open(TABLE, encoding="utf-8", newline="") as file:
+def test_what_is_told_of_a_motion_is_typed_into_the_model():
+    """With damping and armature as people wrote them the old model moves as the repaired one."""
+    knee = next(r for r in MOTION_REPAIRS if r.name == "Pi Plus, knee")
+    wanted = {"q1 inertia": 0.01316 - 0.044277, "q1 viscous": 1.5 - 2.94}
+    told = [{"parameters": {n: {"value": v, "unit": ""}}} for n, v in wanted.items()]
+    truth, old = run(knee.repaired, HELD_OUT)[2], run(knee.old, HELD_OUT)[2]
+    typed = run(axis_with(knee.old, told), HELD_OUT)[2]
+    assert np.abs(old - truth).max() > 0.05 and np.abs(typed - truth).max() < 1e-3
+    assert axis_with(knee.old, [{"parameters": {"q1 offset": {"value": 1.0, "unit": "rad"}}}]) is None
+
+
+@pytest.mark.parametrize(("table", "repairs"), [("repairs", REPAIRS), ("repairs_motion", MOTION_REPAIRS)])
+def test_the_table_has_every_repair(table, repairs):
+    with open(TABLES / f"{table}.csv", encoding="utf-8", newline="") as file:
         header, *rows = csv.reader(file)
     assert tuple(header) == HEADER
-    assert [row[0] for row in rows] == [f"{r.name}, {r.source}" for r in REPAIRS]
+    assert [row[0] for row in rows] == [f"{r.name}, {r.source}" for r in repairs]
     assert all(len(row) == len(HEADER) for row in rows)

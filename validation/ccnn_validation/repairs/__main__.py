@@ -50,7 +50,7 @@ def axes(word: str, seed: int) -> list[tuple[str, ...]]:
         with TemporaryDirectory() as folder:
             found = replayed_motion(repair, Path(folder), seed)
         verdict = found.content["verdict"]
-        said = ", ".join(found.numbers) or verdict["text"]
+        said = ", ".join(found.numbers) or "; ".join(["nothing is named", *found.content["cautions"]])
         typed = "–" if found.typed != found.typed else f"{found.typed:.2g} mrad"
         moved = f"{found.before:.3g} → {typed}"
         sure = f"{verdict['probability']:.2f}"
