@@ -23,7 +23,7 @@ from ccnn_torch.diagnosis.from_file import (
     usable_verdict,
 )
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
-from ccnn_torch.diagnosis.mount import SET_ANEW, mount_notes
+from ccnn_torch.diagnosis.mount import SET_ANEW, frames_taken, mount_notes
 from ccnn_torch.diagnosis.residual.distance import size_of
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, noise_of_columns
 from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
@@ -101,7 +101,8 @@ def diagnose(
         )
     mounted = mount_notes(said, mounts, _word(situation))
     notes = [*records.missing, *said.notes, *mounted, *_unread(records, situation, said)]
-    said = replace(said, lines=tuple(records.lines.tolist())).with_entries(notes=notes, machine=named_machine(said))
+    entries = {"notes": notes, "machine": named_machine(said), "frames": frames_taken(said)}
+    said = replace(said, lines=tuple(records.lines.tolist())).with_entries(**entries)
     return with_network(said, seed) if network else said
 
 

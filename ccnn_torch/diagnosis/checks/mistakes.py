@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis.checks.zeros import wrong_zeros
 from ccnn_torch.diagnosis.residual.distance import USUAL, Size, distance, size_of
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation, pose_residual
@@ -42,6 +43,7 @@ def what_is_wrong(situation: Situation, measured: Tensor, size: Size) -> str:
         or mistake(situation, measured, size, anew=True)
         or tool_remedy(situation, measured, size)
         or frame_remedy(situation, measured, size)
+        or zero_remedy(situation, measured, size)
     )
 
 
@@ -254,6 +256,18 @@ def tool_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
         f"the measured point seems to be at {there} mm from the flange and not at {own} mm, which leaves "
         f"{1e3 * left:.3g} mm; correct tool_offset in its file, or write tool_offset: unknown to have it fitted"
     )
+
+
+def zero_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
+    """Zeros of an arm's joints with which rows and model agree, frames fitted anew; empty where there are none."""
+    arm, finite = situation.mechanism, torch.isfinite(measured).all(-1)
+    if not isinstance(arm, SerialArm) or len(arm.unknown_frames) < 2 or arm.grouped:
+        return ""
+    if arm.orientation == "direction" or int(finite.sum()) < _FEWEST_LATE:
+        return ""
+    joints, measured = situation.joints[finite], measured[finite]
+    before = arm.pose_error(arm.forward_kinematics(joints, _closed_form(arm, joints, measured)), measured).position
+    return wrong_zeros(arm, joints, measured, min(_MENDED * float(before.median()), _LEFT * USUAL * float(size.place)))
 
 
 def _closed_form(arm: SerialArm, joints: Tensor, measured: Tensor) -> Tensor:
