@@ -144,6 +144,8 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
         covariates["time"] = covariates["time"] + _APART * torch.arange(len(joints))
     # Of frames by group those of the first row: the next rows are measured in that group.
     parameters = here.parameters if here.parameters is None or here.parameters.dim() == 1 else here.parameters[0]
+    if len(here.places) > 1:
+        pose = here.pose[drawn[""]]
     return Situation(mechanism, joints, covariates, here.gravity, parameters, pose)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+from ccnn_torch.records.commanded import SECOND
 
 PLATFORM_WEIGHT = 100.0
 """Weight of a platform of which nothing is known [N]."""
@@ -70,13 +71,37 @@ class Situation:
         return replace(self, mechanism=machine.mechanism, guess=guess, parameters=inner)
 
     @cached_property
+    def places(self) -> list[Situation]:
+        """The rows; and where each is of two places of the machine, the same with the second one first.
+
+        Covariates are of both places, but those of which a column with the ending `_b` has the second place's.
+        """
+        machine = self.mechanism
+        if not (isinstance(machine, Instrument) and machine.reading.twice):
+            return [self]
+        second = machine.given(self.guess).expand_as(self.joints)
+        turned = torch.cat([self.pose[..., : machine.compared], self.joints.expand_as(second)], -1)
+        covariates = {n: self.covariates.get(f"{n}{SECOND}", v) for n, v in self.covariates.items()}
+        return [self, replace(self, joints=second, guess=turned, covariates=covariates)]
+
+    def moved(self, joints: Sequence[Tensor], parameters: Tensor | None) -> Situation:
+        """The rows with other joints at each of their places, `... x s x n` [SI], and other parameters."""
+        guess = torch.cat([self.pose[..., : self.mechanism.compared], *joints[1:]], -1) if joints[1:] else self.pose
+        return replace(self, joints=joints[0], parameters=parameters, guess=guess)
+
+    @cached_property
     def pose(self) -> Tensor:
         """Nominal pose at the commanded joints, `... x s x p` [SI]."""
         return self.machine.forward_kinematics(self.joints, self.parameters, self.guess).detach()
 
     @cached_property
     def place(self) -> Tensor:
-        """Where in the workspace the rows are, `... x s x p` [SI]: `where_moved` of the nominal pose and the guess."""
+        """Where in the workspace the rows are, `... x s x p` [SI]: `where_moved` of the nominal pose and the guess.
+
+        Of rows of two places the nominal pose at the first.
+        """
+        if len(self.places) > 1:
+            return self.whole.pose
         return self.pose if self.guess is None else where_moved(self.pose, self.guess)
 
     @cached_property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -15,6 +16,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.board import board_poses
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+from ccnn_torch.records.commanded import SECOND
 
 # Plausible errors: of a focal length and an image's centre as a share of it, of distortion, of a place that a tape
 # measured, of a mounting's turn.
@@ -28,11 +30,15 @@ _BEHIND = 1e-3
 
 
 class Place(NamedTuple):
-    """Position `... x 3` [m] and rotation `... x 3 x 3` (or None) of what holds the instrument, joints `... x n`."""
+    """Position `... x 3` [m] and rotation `... x 3 x 3` (or None) of what holds the instrument, joints `... x n`.
+
+    second: the position with the joints that are given, `... x 3` [m], where the reading is of two places.
+    """
 
     position: Tensor
     rotation: Tensor | None
     joints: Tensor
+    second: Tensor | None = None
 
 
 class Reading(ABC):
@@ -43,6 +49,8 @@ class Reading(ABC):
         keys: from which it was made.
         turns: whether it needs the orientation of what holds it.
         on_links: whether its parameters say how it sits on a link.
+        twice: whether it is of two places of one machine, alike in both; the joints of the second are given.
+        blind: frames of an arm that it never shows.
         read: what it reads; all lengths or all angles, three at most.
         given: what it was pointed at, columns of the records.
         usual: of what is given, where no row says it [SI].
@@ -55,6 +63,8 @@ class Reading(ABC):
     note = ""
     turns = False
     on_links = False
+    twice = False
+    blind: tuple[str, ...] = ()
     keys: dict[str, Any]
     read: tuple[Coordinate, ...]
     given: tuple[Coordinate, ...] = ()
@@ -174,8 +184,7 @@ class Wire(Reading):
         )
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
-        length: Tensor = (place.position - _chosen(own, given[..., 0], 3)).square().sum(-1, keepdim=True)
-        return (length + 1e-24).sqrt()
+        return _apart(place.position, _chosen(own, given[..., 0], 3))
 
     def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
         """|p|² - d² = 2 p·a - |a|² is linear in a and |a|²."""
@@ -188,6 +197,27 @@ class Wire(Reading):
             right = (p.square().sum(-1) - d.square())[:, None]
             found[3 * i : 3 * i + 3] = torch.linalg.lstsq(left, right, driver="gelsd").solution[:3, 0]
         return found
+
+
+class Between(Reading):
+    """Distance between two places that the machine itself reached: a scale bar, a tape between holes, a printed part."""
+
+    kind = "between"
+    twice = True
+    blind = ("base",)
+    read = (Coordinate("distance", "m"),)
+    unknown = ()
+    parameters = ()
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        """The columns of the second place's joints are those of the first and `_b`."""
+        self.keys = {}
+        self.given = tuple(replace(j, name=f"{j.name}{SECOND}") for j in mechanism.joints)
+        self.usual = tuple(mechanism.home_joints.tolist())
+
+    def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
+        assert place.second is not None
+        return _apart(place.position, place.second)
 
 
 class Dial(Reading):
@@ -255,13 +285,13 @@ class Encoder(Reading):
     kind = "encoder"
     unknown = ("encoder",)
 
-    def __init__(self, joint: str, joints: Sequence[Coordinate]) -> None:
+    def __init__(self, joint: str, mechanism: Mechanism) -> None:
         """The joint; its column is the joint's name and `_second`."""
-        names = [j.name for j in joints]
+        names = [j.name for j in mechanism.joints]
         if joint not in names:
             raise InputError(f"joint: there is no joint {joint!r}; write one of {', '.join(names)}")
         self.number = names.index(joint)
-        unit = joints[self.number].unit
+        unit = mechanism.joints[self.number].unit
         self.keys = {"joint": joint}
         self.read = (Coordinate(f"{joint}_second", unit),)
         self.parameters = (Parameter("encoder_offset", unit, 0.0, scale=_PLACE if unit == "m" else _TURN),)
@@ -270,7 +300,7 @@ class Encoder(Reading):
         return place.joints[..., self.number : self.number + 1] + own
 
 
-READINGS: dict[str, Callable[..., Reading]] = {c.kind: c for c in (Camera, Wire, Dial, Level, Encoder)}
+READINGS: dict[str, Callable[..., Reading]] = {c.kind: c for c in (Camera, Wire, Dial, Level, Encoder, Between)}
 """Instruments by name."""
 
 
@@ -282,15 +312,23 @@ def make_reading(kind: str, keys: Mapping[str, Any], mechanism: Mechanism) -> Re
     """
     if kind not in READINGS:
         raise InputError(f"kind: there is no instrument {kind!r}; write one of {', '.join(READINGS)}")
-    takes = [name for name in inspect.signature(READINGS[kind]).parameters if name != "joints"]
+    asks = [*inspect.signature(READINGS[kind]).parameters]
+    takes = [name for name in asks if name != "mechanism"]
     wrong = [name for name in keys if name not in takes]
     if wrong:
-        raise InputError(f"mechanism 'instrument': a {kind} has no key {wrong[0]!r}; it has {', '.join(takes)}")
-    more = {"joints": mechanism.joints} if kind == "encoder" else {}
+        there = ", ".join(takes) or "none"
+        raise InputError(f"mechanism 'instrument': a {kind} has no key {wrong[0]!r}; it has {there}")
+    more = {"mechanism": mechanism} if "mechanism" in asks else {}
     try:
         return READINGS[kind](**keys, **more)
     except TypeError as reason:
         raise InputError(f"mechanism 'instrument': {kind}: {reason}; its keys are {', '.join(takes)}") from None
+
+
+def _apart(here: Tensor, there: Tensor) -> Tensor:
+    """Distance of points, `... x 1` [m], with a derivative where it is 0."""
+    square: Tensor = (here - there).square().sum(-1, keepdim=True)
+    return (square + 1e-24).sqrt()
 
 
 def _count(value: int, key: str) -> int:
