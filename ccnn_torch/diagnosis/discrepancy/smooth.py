@@ -17,6 +17,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import Atom, discrepancy
 from ccnn_torch.effects import Situation
 from ccnn_torch.evidence.priors import OUTSIDE
+from ccnn_torch.records.commanded import SECOND
 
 # Log odds of one that holds most of what a library effect does beside those of the others.
 _NEAR_LIBRARY = math.log(1e-2)
@@ -113,7 +114,9 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
 
 
 def driver_of(name: str) -> str | None:
-    """What a covariate is called as a driver; None for one that is none."""
+    """What a covariate is called as a driver; None for one that is none, or that is another's in the second place."""
+    if name.endswith(SECOND):
+        return None
     if name.startswith("load_"):
         return f"load {name.removeprefix('load_')}"
     if name.startswith("direction"):

@@ -184,11 +184,17 @@ class Instrument(Seen):
         for _ in range(_ROUNDS):
 
             def gap(values: Tensor, kept: Tensor = kept, start: Tensor = start) -> Tensor:
-                full = start.index_copy(0, torch.tensor(free), values)
+                full = start.expand(*values.shape[:-1], -1).index_copy(-1, torch.tensor(free), values)
                 left = self.forward_kinematics(q, full, x) - x
-                return (left[:, : self.compared] * kept[:, None]).flatten()
+                return left[:, : self.compared] * kept[:, None]
 
-            found = levenberg_marquardt(gap, start[free], lambda v, gap=gap: jacobian_of(gap, v)[1], max_iterations=100)
+            found = levenberg_marquardt(
+                lambda v, gap=gap: gap(v).flatten(),
+                start[free],
+                # A row's residual is of its own copy of the values: one pass for each reading and not for each row.
+                lambda v, gap=gap: jacobian_of(gap, v.expand(len(q), -1))[1].flatten(0, 1),
+                max_iterations=100,
+            )
             start = start.index_copy(0, torch.tensor(free), found.value)
             left = self.forward_kinematics(q, start, x)[:, : self.compared] - x[:, : self.compared]
             kept = inlying(left.norm(dim=-1).nan_to_num(nan=torch.inf), kept >= 0, self.compared, len(free)).double()

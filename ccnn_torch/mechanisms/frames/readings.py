@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.board import board_poses
 from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
 
@@ -25,6 +26,8 @@ PIXEL = 1e-6
 """A pixel counts as this length on the image [m], as columns in px are read."""
 # Numbers of a lens.
 _LENS = 6
+# Rows of an anchor or a plane.
+_FEWEST = 4
 # Nothing is seen nearer to a camera than this [m].
 _BEHIND = 1e-3
 
@@ -118,7 +121,7 @@ class Camera(Reading):
         A board whose corners are known only to `board_tolerance` [m] has so many `corners`, which the column `corner`
         numbers from 1.
         """
-        self.corners = _count(corners, "corners") if corners else 0
+        self.corners = len(_numbers(corners, "corners")) if corners else 0
         self.on_hand, self.unknown = on_hand, ("camera",) if refine else ()
         focus = fx if fy is None else fy
         self.keys = {"fx": fx, "cx": cx, "cy": cy, "fy": focus, "k1": k1, "k2": k2, "on_hand": on_hand}
@@ -143,7 +146,7 @@ class Camera(Reading):
         assert place.rotation is not None
         point = given[..., :3]
         if self.corners:
-            point = point + _chosen(own[..., _LENS:], given[..., 3], 3)
+            point = point + _chosen(own[..., _LENS:], given[..., 3], 3, _numbers(self.corners, "corners"))
         if self.on_hand:
             seen = (place.rotation.mT @ (point - place.position)[..., None])[..., 0]
         else:
@@ -172,27 +175,24 @@ class Wire(Reading):
     kind = "wire"
     read = (Coordinate("distance", "m"),)
     given = (Coordinate("anchor", "1"),)
-    usual = (1.0,)
 
-    def __init__(self, anchors: int = 1) -> None:
-        """How many anchors there are; the column `anchor` numbers them from 1."""
-        self.anchors = _count(anchors, "anchors")
+    def __init__(self, anchors: int | Sequence[float] = 1) -> None:
+        """How many anchors there are, which the column `anchor` numbers from 1; or their numbers there."""
+        self.groups = _numbers(anchors, "anchors")
         self.keys = {"anchors": anchors}
-        self.unknown = tuple(f"anchor{i + 1}" for i in range(self.anchors))
+        self.unknown = tuple(f"anchor{n:g}" for n in self.groups)
+        self.usual = (self.groups[0],)
         self.parameters = tuple(
             Parameter(f"{name}_{axis}", "m", 0.0, scale=_PLACE) for name in self.unknown for axis in "xyz"
         )
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
-        return _apart(place.position, _chosen(own, given[..., 0], 3))
+        return _apart(place.position, _chosen(own, given[..., 0], 3, self.groups))
 
     def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
         """|p|² - d² = 2 p·a - |a|² is linear in a and |a|²."""
         found = own.clone()
-        for i in range(self.anchors):
-            p, d = place.position[rows[:, 1] == i + 1], rows[rows[:, 1] == i + 1, 0]
-            if len(p) < 4:
-                raise InputError(f"anchor {i + 1}: needs at least 4 rows, got {len(p)}; measure it more often")
+        for i, (p, d) in enumerate(_by_group(place, rows, self.groups, "anchor")):
             left = torch.cat([2 * p, -torch.ones_like(p[:, :1])], dim=-1)
             right = (p.square().sum(-1) - d.square())[:, None]
             found[3 * i : 3 * i + 3] = torch.linalg.lstsq(left, right, driver="gelsd").solution[:3, 0]
@@ -200,7 +200,7 @@ class Wire(Reading):
 
 
 class Between(Reading):
-    """Distance between two places that the machine itself reached: a scale bar, a tape between holes, a printed part."""
+    """Distance of two places that the machine itself reached: a scale bar, a tape between holes, a printed part."""
 
     kind = "between"
     twice = True
@@ -226,17 +226,21 @@ class Dial(Reading):
     kind = "dial"
     read = (Coordinate("reading", "m"),)
     given = (Coordinate("plane", "1"),)
-    usual = (1.0,)
 
-    def __init__(self, normals: Sequence[Sequence[float]] = ((0.0, 0.0, 1.0),)) -> None:
-        """The normal of each plane, roughly, in the measuring frame; the column `plane` numbers them from 1."""
+    def __init__(
+        self, normals: Sequence[Sequence[float]] = ((0.0, 0.0, 1.0),), planes: Sequence[float] | None = None
+    ) -> None:
+        """The normal of each plane, roughly, in the measuring frame; and the planes' numbers in the column `plane`,
+        from 1 when None."""
         axes = torch.tensor([list(map(float, n)) for n in normals], dtype=torch.float64)
         if axes.dim() != 2 or axes.shape[-1] != 3 or bool((axes.norm(dim=-1) == 0).any()):
             raise InputError(f"normals: write a direction x, y, z for each plane, not {normals!r}")
-        self.keys = {"normals": [list(n) for n in normals]}
+        self.groups = _numbers(len(axes) if planes is None else planes, "planes", len(axes))
+        self.keys = {"normals": [list(n) for n in normals], "planes": self.groups}
+        self.usual = (self.groups[0],)
         full = torch.linalg.svd(axes[:, None], full_matrices=True)[2]
         self.axes = torch.cat([axes[:, None] / axes.norm(dim=-1)[:, None, None], full[:, 1:]], 1)
-        self.unknown = tuple(f"plane{i + 1}" for i in range(len(axes)))
+        self.unknown = tuple(f"plane{n:g}" for n in self.groups)
         self.parameters = tuple(
             Parameter(f"{name}_{part}", unit, 0.0, scale=scale)
             for name in self.unknown
@@ -244,11 +248,18 @@ class Dial(Reading):
         )
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
-        mine = _chosen(own, given[..., 0], 3)
-        axes = self.axes[_number(given[..., 0], len(self.axes))]
+        mine = _chosen(own, given[..., 0], 3, self.groups)
+        axes = self.axes[_number(given[..., 0], self.groups)]
         turn = (mine[..., 1:, None] * axes[..., 1:, :]).sum(-2)
         normal = (rotation_vector_to_matrix(turn) @ axes[..., 0, :, None])[..., 0]
         return (place.position * normal).sum(-1, keepdim=True) - mine[..., :1]
+
+    def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
+        """The heights; the normals as they are."""
+        found = own.clone()
+        for i, (p, r) in enumerate(_by_group(place, rows, self.groups, "plane")):
+            found[3 * i] = (p @ self.axes[i, 0] - r).mean()
+        return found
 
 
 class Level(Reading):
@@ -331,20 +342,37 @@ def _apart(here: Tensor, there: Tensor) -> Tensor:
     return (square + 1e-24).sqrt()
 
 
-def _count(value: int, key: str) -> int:
-    if not isinstance(value, int) or not 1 <= value <= 100:
-        raise InputError(f"{key}: {value!r} is no number of them; write 1 to 100")
-    return value
+def _numbers(given: int | Sequence[float], key: str, count: int | None = None) -> list[float]:
+    """Numbers of groups: 1, 2 … where only how many is given; count: how many there have to be."""
+    found = [float(n) for n in (range(1, given + 1) if isinstance(given, int) else given)]
+    if not 1 <= len(found) <= 100 or len(set(found)) < len(found) or len(found) != (count or len(found)):
+        raise InputError(f"{key}: {given!r} is no number of them; write 1 to 100")
+    return found
 
 
-def _number(column: Tensor, count: int) -> Tensor:
-    """The number from 0 of each row's group; what is no group is the nearest."""
-    return (column.round() - 1).clamp(0, count - 1).to(torch.int64)
+def _number(column: Tensor, groups: Sequence[float]) -> Tensor:
+    """Which of the groups each row is of, from 0; what is no group's number is the nearest's."""
+    return (column[..., None] - torch.tensor(groups, dtype=column.dtype)).abs().argmin(-1)
 
 
-def _chosen(own: Tensor, column: Tensor, width: int) -> Tensor:
+def _chosen(own: Tensor, column: Tensor, width: int, groups: Sequence[float]) -> Tensor:
     """Of the parameters of all groups `... x (g w)` those of each row's, `... x w`."""
-    number = _number(column, own.shape[-1] // width)
-    lead = torch.broadcast_shapes(own.shape[:-1], number.shape)  # type: ignore[no-untyped-call]
-    index = (number[..., None] * width + torch.arange(width)).expand(*lead, width)
-    return own.expand(*lead, -1).gather(-1, index)
+    number = _number(column, groups)
+    index = number[..., None] * width + torch.arange(width)
+    return expand_leading(own, index).gather(-1, expand_leading(index, own))
+
+
+def _by_group(place: Place, rows: Tensor, groups: Sequence[float], what: str) -> Iterator[tuple[Tensor, Tensor]]:
+    """Positions `t x 3` and readings `t` of each group, whose number is the second column of the rows.
+
+    Raises:
+        InputError: a group of fewer than four rows.
+    """
+    for i, label in enumerate(groups):
+        mine = _number(rows[:, 1], groups) == i
+        if int(mine.sum()) < _FEWEST:
+            raise InputError(
+                f"{what} {label:g}: needs at least {_FEWEST} rows that count, got {int(mine.sum())}; measure it more "
+                "often, or leave its rows out of the records"
+            )
+        yield place.position[mine], rows[mine, 0]
