@@ -142,7 +142,7 @@ def _normal(points: Tensor, readings: Tensor) -> list[float]:
     """Of the plane near points `s x 3` [m], towards where the readings `s` rise."""
     normal = torch.linalg.svd(points - points.mean(0), full_matrices=True)[2][-1]
     rising = float(((points @ normal) * (readings - readings.mean())).sum())
-    return (-normal if rising < 0 else normal).tolist()
+    return [float(v) for v in (-normal if rising < 0 else normal)]
 
 
 def placed(rows: ConstraintRows) -> ConstraintRows:

@@ -178,7 +178,7 @@ def _directions(situation: Situation, order: Tensor) -> dict[str, Tensor]:
     rows = torch.arange(len(way))[:, None].expand_as(way)
     last = torch.where(way != 0, rows, 0).cummax(0).values
     signs = torch.empty_like(joints)
-    signs[order] = way.gather(0, last).unflatten(0, joints.shape[:2])
+    signs[order] = way.gather(0, last).reshape(joints.shape)
     return {
         f"direction{i + 1}{ending}": way
         for ending, place in zip(("", SECOND), signs.unbind(1), strict=False)

@@ -303,7 +303,10 @@ def _discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
             covariates={n: torch.cat([place.covariates[n] for place in places]) for n in situation.covariates},
         )
     found = [*smooth_discrepancies(situation, beside), *linear_discrepancies(situation, beside)]
-    return [replace(a, columns=sum(a.columns.chunk(len(places)))) for a in found] if len(places) > 1 else found
+    return [
+        replace(a, columns=a.columns.reshape(len(places), -1, *a.columns.shape[1:]).sum(0)) if len(places) > 1 else a
+        for a in found
+    ]
 
 
 def _with_shared_noise(state: Analysis) -> Analysis:
