@@ -24,7 +24,7 @@ from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, sp
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, load_mechanism
+from ccnn_torch.mechanisms import Instrument, Mechanism, SerialArm, as_measured, load_mechanism
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
@@ -215,6 +215,11 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
+    if isinstance(mechanism, Instrument) and mechanism.reading.twice:
+        raise InputError(
+            f"{records.path}: each row is of two places, and what ccnn run learns has the joints of one; find geometry "
+            "and effects with ccnn diagnose, whose diagnosis.json ccnn compensate and ccnn verify take"
+        )
     if isinstance(mechanism, SerialArm) and config.geometry != "none":
         mechanism = mechanism.with_link_frames()
     held = rows_of_test_file(config.split, records.parts)

@@ -1,0 +1,126 @@
+"""Distances between two places that a machine itself reached, in every command, from rows that code of its own made."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from identify.instruments import Arm, Array, arm_file, joints
+
+from ccnn_torch import diagnose
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.planning.config import PlanConfig
+from ccnn_torch.planning.job import make_plan, write_plan
+from ccnn_torch.records import load_records, read_table
+from ccnn_torch.testing import check_effect
+
+NOISE = 2e-5
+Move = Callable[[Array, Array], Array]
+"""Where the joints of visits in turn `s x 6` really are, with the signs of the ways there."""
+
+
+def gear(q: Array, way: Array) -> Array:
+    """Four waves a turn of the third joint."""
+    return q + 4e-4 * np.cos(4 * q[:, [2]]) * [0, 0, 1, 0, 0, 0]
+
+
+def play(q: Array, way: Array) -> Array:
+    """Of 0.4 and 0.6 mrad, in the second and third joint."""
+    return q - way * [0, 2e-4, 3e-4, 0, 0, 0]
+
+
+def pairs(path: Path, count: int, seed: int, move: Move) -> Path:
+    """The distances of a true arm whose links are as drawn, and of the joints that it was sent to."""
+    visits, rng = joints(2 * count, seed), np.random.default_rng(seed)
+    moved = move(visits, np.sign(np.diff(visits, axis=0, prepend=visits[:1] - 1)))
+    tips = np.array([Arm(None).tip(q) for q in moved]).reshape(count, 2, 3)
+    far = np.linalg.norm(tips[:, 0] - tips[:, 1], axis=1) + rng.normal(0, NOISE, count)
+    names = [f"q{i + 1}{end}[rad]" for end in ("", "_b") for i in range(6)]
+    table = np.column_stack([visits.reshape(count, 12), far])
+    np.savetxt(path, table, delimiter=",", header=",".join([*names, "distance[m]"]), comments="", fmt="%.10g")
+    return path
+
+
+def between(folder: Path, frames: bool = True) -> dict[str, Any]:
+    return {"mechanism": str(arm_file(folder, frames=frames)), "kind": "between"}
+
+
+def test_an_error_of_a_joint_acts_in_both_places(tmp_path: Path, cli: Callable[..., tuple[int, str, str]]) -> None:
+    """Named, delivered as a machine of six joints, and right on distances of another day, by the commands."""
+    records, later = pairs(tmp_path / "a.csv", 200, 9, gear), pairs(tmp_path / "b.csv", 60, 5, gear)
+    config = tmp_path / "own.yaml"
+    keys = "".join(f"  {name}: {value}\n" for name, value in between(tmp_path).items())
+    config.write_text(f"records: {records}\nmechanism: instrument\nmechanism_keys:\n{keys}")
+    effects = "effects=geometry,joint_offset,joint_gain,transmission,gravity,coupling"
+    code, out, err = cli("diagnose", "--config", config, effects, "--out", tmp_path / "d", "--no-network")
+    assert code == 0, out + err
+    machine = load_mechanism(str(tmp_path / "d" / "diagnosis.json"))
+    assert [j.name for j in machine.joints] == ["q1", "q2", "q3", "q4", "q5", "q6"]
+    code, out, err = cli(
+        "verify", tmp_path / "d" / "diagnosis.json", "--config", config, "--records", later, "--out", tmp_path / "v"
+    )
+    assert code == 0, out + err
+    # Effects on both joints, at their own amplitude: half of it would leave half of the gap.
+    said = json.loads((tmp_path / "v" / "verify.json").read_text())["position"]
+    assert said["after"]["rms"] < 1.2 * NOISE < 4 * NOISE < said["before"]["rms"]
+    commands = tmp_path / "commands.csv"
+    code, out, err = cli("compensate", tmp_path / "d" / "diagnosis.json", later, commands)
+    assert code == 0, out + err
+    table = read_table(commands)
+    command = np.column_stack([table.column(f"command_q{i + 1}", "rad") for i in range(6)])
+    wanted = np.column_stack([table.column(f"q{i + 1}", "rad") for i in range(6)])
+    reached, ideal = (np.array([Arm(None).tip(q) for q in v]) for v in (gear(command, command), wanted))
+    raw = np.array([Arm(None).tip(q) for q in gear(wanted, wanted)])
+    after, before = (float(np.linalg.norm(v - ideal, axis=1).mean()) for v in (reached, raw))
+    assert after < 0.2 * before
+
+
+def test_the_way_to_each_place_follows_from_the_order_of_the_rows(tmp_path: Path) -> None:
+    machine = load_mechanism("instrument", **between(tmp_path))
+    rows = load_records(str(pairs(tmp_path / "a.csv", 150, 9, play)), machine)
+    found = diagnose(
+        rows, machine, effects=["geometry", "joint_offset", "backlash", "gravity", "joint_gain"], network=True
+    )
+    assert found.verdict["effects"] == ["backlash"]
+    size = next(e for e in found.effects if e["name"] == "backlash")["parameters"]
+    assert size["q2"]["value"] == pytest.approx(4e-4, rel=0.1) and size["q3"]["value"] == pytest.approx(6e-4, rel=0.1)
+    assert found.network["reason"] == "each row is of two places, and a network has the joints of one"
+    assert set(found.next_measurements[0]["joints"]) == {f"q{i + 1}{end}" for end in ("", "_b") for i in range(6)}
+
+
+@pytest.mark.parametrize("name", ["transmission", "gravity", "compliance", "thermal", "tool", "geometry"])
+def test_effects_change_a_distance_by_what_they_do_at_both_ends(name: str, tmp_path: Path) -> None:
+    """Their columns beside differences of what is reached; of joints, parameters and the pose."""
+    check_effect(name, load_mechanism("instrument", **between(tmp_path, frames=False)))
+
+
+def test_both_places_are_planned_within_the_limits(tmp_path: Path) -> None:
+    machine = load_mechanism("instrument", **between(tmp_path, frames=False))
+    config = PlanConfig.from_file(None, ["candidates=80", "limits={q1: [-1 rad, 1 rad]}", "program=krl"])
+    _, plans = make_plan(machine, 24, config)
+    write_plan(tmp_path / "plan.csv", machine, plans, 0.02, config)
+    table = read_table(tmp_path / "plan.csv")
+    ends = [table.column(f"q1{end}", "rad") for end in ("", "_b")]
+    assert all(len(np.unique(q)) == 24 and np.abs(q).max() <= 1 for q in ends)
+    own = [np.column_stack([table.column(f"q{i + 1}{end}", "rad") for i in range(6)]) for end in ("", "_b")]
+    tips = [np.array([Arm(None).tip(q) for q in place]) for place in own]
+    np.testing.assert_allclose(table.column("distance", "m"), np.linalg.norm(tips[0] - tips[1], axis=1), atol=1e-9)
+    moves = [line for line in (tmp_path / "plan.src").read_text().splitlines() if "PTP {A1" in line]
+    assert [float(line.split()[2].rstrip(",")) for line in moves] == pytest.approx(
+        np.rad2deg(np.column_stack(ends).ravel()), abs=1e-3
+    )
+
+
+def test_what_two_places_cannot_be_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="a between has no key 'anchors'; it has none"):
+        load_mechanism("instrument", **between(tmp_path), anchors=2)
+    machine = load_mechanism("instrument", **between(tmp_path))
+    assert "base" not in getattr(machine, "unknown_frames", ())
+    q = torch.from_numpy(joints(1, 0)[0])
+    assert float(machine.forward_kinematics(q, guess=torch.cat([q[:1], q]))[0]) < 1e-9
