@@ -293,10 +293,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         used = used_covariates(situation, acting)
         situation = replace(situation, covariates={n: v for n, v in situation.covariates.items() if n in used})
         if isinstance(situation.mechanism, Instrument):
-            each = [place.whole for place in situation.places]
-            covariates = {n: torch.cat([one.covariates[n] for one in each]) for n in each[0].covariates}
-            joints = torch.cat([one.joints for one in each])
-            situation = replace(each[0], joints=joints, covariates=covariates, guess=None)
+            situation = situation.visits
             values = values[..., : len(situation.mechanism.geometry)]
         return found_block(situation, values, acting, covariate_units(situation.mechanism))
     except InputError:

@@ -76,13 +76,21 @@ class Situation:
 
         Covariates are of both places, but those of which a column with the ending `_b` has the second place's.
         """
-        machine = self.mechanism
-        if not (isinstance(machine, Instrument) and machine.reading.twice):
+        joints = self.mechanism.places(self.joints, self.guess)
+        if len(joints) == 1:
             return [self]
-        second = machine.given(self.guess).expand_as(self.joints)
-        turned = torch.cat([self.pose[..., : machine.compared], self.joints.expand_as(second)], -1)
+        turned = torch.cat([self.pose[..., : self.mechanism.compared], self.joints], -1)
         covariates = {n: self.covariates.get(f"{n}{SECOND}", v) for n, v in self.covariates.items()}
-        return [self, replace(self, joints=second, guess=turned, covariates=covariates)]
+        return [self, replace(self, joints=joints[1], guess=turned, covariates=covariates)]
+
+    @cached_property
+    def visits(self) -> Situation:
+        """The machine itself with its whole pose, in the first place of every row and then in the second ones."""
+        each = [place.whole for place in self.places]
+        if len(each) == 1:
+            return self.whole
+        covariates = {n: torch.cat([one.covariates[n] for one in each]) for n in self.covariates}
+        return replace(each[0], joints=torch.cat([one.joints for one in each]), covariates=covariates, guess=None)
 
     def moved(self, joints: Sequence[Tensor], parameters: Tensor | None) -> Situation:
         """The rows with other joints at each of their places, `... x s x n` [SI], and other parameters."""

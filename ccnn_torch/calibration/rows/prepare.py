@@ -24,7 +24,7 @@ from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, sp
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Instrument, Mechanism, SerialArm, as_measured, load_mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, load_mechanism
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
@@ -215,10 +215,10 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
-    if isinstance(mechanism, Instrument) and mechanism.reading.twice:
+    if _twice(mechanism, records) and method_names(config, "constant") != ["constant"]:
         raise InputError(
-            f"{records.path}: each row is of two places, and what ccnn run learns has the joints of one; find geometry "
-            "and effects with ccnn diagnose, whose diagnosis.json ccnn compensate and ccnn verify take"
+            f"methods: each row of {records.path} is of two places, and what a learner learns has the joints of one; "
+            "leave methods out, and geometry and effects alone are identified and corrected"
         )
     if isinstance(mechanism, SerialArm) and config.geometry != "none":
         mechanism = mechanism.with_link_frames()
@@ -231,6 +231,11 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     prepared = _fitted_to(Source(mechanism, records, settings, choice, verdict), splits, seeds)
     notes = [*held_out_notes(config.split, len(splits[0].test), splits[0]), *notes, *prepared.notes]
     return replace(prepared, notes=notes)
+
+
+def _twice(mechanism: Mechanism, records: Records) -> bool:
+    """Whether each row is of two places, so that there is no deviation of joints to learn."""
+    return len(mechanism.places(records.joints, records.pose)) > 1
 
 
 def over_all_rows(prepared: Prepared) -> Prepared:
@@ -261,6 +266,8 @@ def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepare
     if physics is not None:
         learned = physics.values
         deviations = physics.targets(records.joints, records.pose, settings)
+    if _twice(mechanism, records):
+        deviations = replace(deviations, deviation=torch.zeros_like(deviations.deviation))
     guess = completed(mechanism, records.joints, records.pose, frames)
     jacobian = mechanism.jacobian(records.joints, learned, guess=guess)
     return Prepared(
@@ -312,6 +319,7 @@ def _choice(
         verdict,
         asked,
         method_names(config, "") == [""],
+        not _twice(mechanism, records),
     )
     choice = choose_model(mechanism, records, *about)
     return choice, verdict if choice.effects else None, records, notes

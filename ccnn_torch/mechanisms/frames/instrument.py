@@ -112,6 +112,10 @@ class Instrument(Seen):
         """What the rows `... x p` were of, `... x g` [SI]; what is usual where there are none."""
         return (self.home_pose if rows is None else rows)[..., self.compared :]
 
+    def places(self, joints: Tensor, rows: Tensor | None) -> list[Tensor]:
+        """Of rows whose reading is of two places, both."""
+        return [joints, self.given(rows).expand_as(joints)] if self.reading.twice else [joints]
+
     def sample_given(self, count: int, generator: torch.Generator) -> Tensor:
         """Rows of what is usual, or of second places all over the workspace, `count x p` [SI]; nothing is read yet."""
         rows = self.home_pose.expand(count, -1)
