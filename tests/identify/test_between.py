@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -64,21 +63,13 @@ def test_an_error_of_a_joint_acts_in_both_places(tmp_path: Path, cli: Callable[.
     effects = "effects=geometry,joint_gain,transmission,gravity"
     code, out, err = cli("diagnose", "--config", config, effects, "--out", tmp_path / "d", "--no-network")
     assert code == 0, out + err
-    machine = load_mechanism(str(tmp_path / "d" / "diagnosis.json"))
-    assert [j.name for j in machine.joints] == ["q1", "q2", "q3", "q4", "q5", "q6"]
-    code, out, err = cli(
-        "verify", tmp_path / "d" / "diagnosis.json", "--config", config, "--records", later, "--out", tmp_path / "v"
-    )
-    assert code == 0, out + err
+    model = load_compensation(tmp_path / "d" / "diagnosis.json")
+    assert [j.name for j in model.joints] == ["q1", "q2", "q3", "q4", "q5", "q6"]
+    said = verify_model(model, str(later), "instrument", mechanism_keys=between(tmp_path)).results.position
     # Effects on both joints, at their own amplitude: half of it would leave half of the gap.
-    said = json.loads((tmp_path / "v" / "verify.json").read_text())["position"]
-    assert said["after"]["rms"] < 1.2 * NOISE < 4 * NOISE < said["before"]["rms"]
-    commands = tmp_path / "commands.csv"
-    code, out, err = cli("compensate", tmp_path / "d" / "diagnosis.json", later, commands)
-    assert code == 0, out + err
-    table = read_table(commands)
-    command = np.column_stack([table.column(f"command_q{i + 1}", "rad") for i in range(6)])
-    wanted = np.column_stack([table.column(f"q{i + 1}", "rad") for i in range(6)])
+    assert said.after.rms < 1.2 * NOISE < 4 * NOISE < said.before.rms
+    wanted = joints(40, 6)
+    command = np.asarray(model(wanted)["command"])
     reached, ideal = (np.array([Arm(None).tip(q) for q in v]) for v in (gear(command, command), wanted))
     raw = np.array([Arm(None).tip(q) for q in gear(wanted, wanted)])
     after, before = (float(np.linalg.norm(v - ideal, axis=1).mean()) for v in (reached, raw))
