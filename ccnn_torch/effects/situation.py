@@ -112,6 +112,12 @@ class Situation:
             return self.whole.pose
         return self.pose if self.guess is None else where_moved(self.pose, self.guess)
 
+    @property
+    def lengths(self) -> list[int]:
+        """Numbers of the coordinates of `place` that are lengths."""
+        mechanism = self.mechanism if len(self.places) == 1 else self.whole.mechanism
+        return [k for k, c in enumerate(mechanism.pose) if c.unit == "m"]
+
     @cached_property
     def jacobian(self) -> Tensor:
         """Derivative of position and rotation vector by the joints, `... x s x c x n`, c = 3 or 6; NaN without pose."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ccnn_validation import printer
 from identify.instruments import Arm, Array, arm_file, joints
 
 from ccnn_torch import diagnose
@@ -108,6 +109,23 @@ def test_a_run_identifies_from_both_places_and_keeps_its_promise(tmp_path: Path)
     table = read_table(Path(keys["records"]))
     second = np.column_stack([table.column(f"q{i + 1}_b", "rad") for i in range(6)])
     assert bool((second > model.region[:, 0]).all() and (second < model.region[:, 1]).all())
+
+
+@pytest.mark.parametrize("noise", [None, 2e-5])
+def test_marks_that_a_printer_made_show_its_geometry(tmp_path: Path, noise: float | None) -> None:
+    """Of places that were commanded. Joints that are lengths are no readings: there is one a row, with its noise."""
+    rng = np.random.default_rng(0)
+    one, two = (np.c_[printer.bed(rng, 60)[:, :2], rng.uniform(0, 0.1, 60)] for _ in range(2))
+    there = [printer.reached(printer.carriages(place, np.zeros(12)), place) for place in (one, two)]
+    far = np.linalg.norm(there[0] - there[1], axis=1) + rng.normal(0, NOISE, 60)
+    names = [f"goal_{axis}{end}[m]" for end in ("", "_b") for axis in "xyz"]
+    header = ",".join([*names, "distance[m]"])
+    np.savetxt(tmp_path / "m.csv", np.column_stack([one, two, far]), delimiter=",", header=header, comments="")
+    (tmp_path / "own.yaml").write_text(printer.FILE)
+    machine = load_mechanism("instrument", mechanism=str(tmp_path / "own.yaml"), kind="between")
+    found = diagnose(load_records(str(tmp_path / "m.csv"), machine, learns=False), machine, noise=noise)
+    assert found.verdict["effects"] == ["geometry"] and not found.verdict["outside_library"]
+    assert found.analysis.whitening.sigma.tolist() == pytest.approx([NOISE], rel=0.3 if noise is None else 1e-9)
 
 
 @pytest.mark.parametrize("name", ["transmission", "gravity", "compliance", "thermal", "tool", "geometry"])

@@ -293,7 +293,7 @@ def _about_best_set(state: Analysis) -> Analysis | None:
 
 def _discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
     """Terms for each driver; of rows of two places what the driver does at both."""
-    places = situation.places
+    places, rows = situation.places, len(situation.joints)
     if len(places) > 1:
         shown = [place.pose if place.guess is None else place.guess for place in places]
         situation = replace(
@@ -302,9 +302,9 @@ def _discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
             guess=torch.cat(shown),
             covariates={n: torch.cat([place.covariates[n] for place in places]) for n in situation.covariates},
         )
-    found = [*smooth_discrepancies(situation, beside), *linear_discrepancies(situation, beside)]
+    found = [*smooth_discrepancies(situation, beside, rows), *linear_discrepancies(situation, beside)]
     return [
-        replace(a, columns=a.columns.reshape(len(places), -1, *a.columns.shape[1:]).sum(0)) if len(places) > 1 else a
+        replace(a, columns=a.columns.reshape(len(places), rows, *a.columns.shape[1:]).sum(0)) if len(places) > 1 else a
         for a in found
     ]
 
