@@ -295,11 +295,10 @@ def _discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
     """Terms for each driver; of rows of two places what the driver does at both."""
     places, rows = situation.places, len(situation.joints)
     if len(places) > 1:
-        shown = [place.pose if place.guess is None else place.guess for place in places]
         situation = replace(
             situation,
             joints=torch.cat([place.joints for place in places]),
-            guess=torch.cat(shown),
+            guess=torch.cat([place.pose for place in places]),
             covariates={n: torch.cat([place.covariates[n] for place in places]) for n in situation.covariates},
         )
     found = [*smooth_discrepancies(situation, beside, rows), *linear_discrepancies(situation, beside)]

@@ -117,11 +117,15 @@ class Instrument(Seen):
         return [joints, self.given(rows).expand_as(joints)] if self.reading.twice else [joints]
 
     def sample_given(self, count: int, generator: torch.Generator) -> Tensor:
-        """Rows of what is usual, or of second places all over the workspace, `count x p` [SI]; nothing is read yet."""
-        rows = self.home_pose.expand(count, -1)
-        if not self.reading.twice:
+        """Rows of any anchor, plane or second place, `count x p` [SI]; nothing is read yet."""
+        rows, groups = self.home_pose.expand(count, -1), torch.tensor(self.reading.groups, dtype=torch.float64)
+        if self.reading.twice:
+            given = self.mechanism.sample_joints(count, generator)
+        elif len(groups):
+            given = groups[torch.randint(len(groups), (count, 1), generator=generator)]
+        else:
             return rows
-        return torch.cat([rows[:, : self.compared], self.mechanism.sample_joints(count, generator)], -1)
+        return torch.cat([rows[:, : self.compared], given], -1)
 
     def frame(self, pose: Tensor) -> Frame:
         """What is read: lengths as a position, angles as a rotation vector."""

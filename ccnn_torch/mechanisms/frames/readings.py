@@ -54,6 +54,7 @@ class Reading(ABC):
         on_links: whether its parameters say how it sits on a link.
         twice: whether it is of two places of one machine, alike in both; the joints of the second are given.
         blind: frames of an arm that it never shows.
+        groups: numbers of its anchors or planes in the column that is given.
         read: what it reads; all lengths or all angles, three at most.
         given: what it was pointed at, columns of the records.
         usual: of what is given, where no row says it [SI].
@@ -68,6 +69,7 @@ class Reading(ABC):
     on_links = False
     twice = False
     blind: tuple[str, ...] = ()
+    groups: Sequence[float] = ()
     keys: dict[str, Any]
     read: tuple[Coordinate, ...]
     given: tuple[Coordinate, ...] = ()
