@@ -222,31 +222,34 @@ def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) ->
     if noise is None:
         return None
     count = situation.jacobian.shape[-2]
-    names = [c.name for c in situation.mechanism.pose]
+    pose, measured = situation.mechanism.pose, situation.mechanism.pose[: situation.mechanism.compared]
+    names = [c.name for c in measured]
     if isinstance(noise, str):
         raise InputError(
             f"noise: '{noise}' is a text; give a number in SI (1e-5), or one for each of {', '.join(names)}"
         )
     if not isinstance(noise, Mapping):
         noise = dict.fromkeys(names, float(noise))
-    wrong = [n for n in noise if n not in names]
+    # What an instrument was pointed at needs none.
+    wrong = [n for n in noise if all(n != c.name for c in pose)]
     missing = [n for n in names if n not in noise]
     if wrong or missing:
         said = f"there is no pose coordinate {wrong[0]}" if wrong else f"gives nothing for {', '.join(missing)}"
         raise InputError(f"noise: {said}; the pose is {', '.join(names)}")
+    noise = {n: noise[n] for n in names}
     low = [n for n, v in noise.items() if not 0 < float(v) < float("inf")]
     if low:
         raise InputError(f"noise: must be above 0, not {noise[low[0]]!r} for {low[0]}")
     spread = float(size_of(situation).place)
-    wide = [c.name for c in situation.mechanism.pose if c.unit == "m" and noise[c.name] > spread]
+    wide = [c.name for c in measured if c.unit == "m" and noise[c.name] > spread]
     if wide:
         value = noise[wide[0]]
         raise InputError(
             f"noise: {value:.4g} m for {wide[0]} is more than {situation.mechanism.name} moves (its poses are spread "
             f"over {spread:.3g} m); write the unit, e.g. {value:g}um"
         )
-    lengths = [v for n, v in noise.items() if n in _POSITION]
-    angles = [v for n, v in noise.items() if n not in _POSITION]
+    lengths = [noise[c.name] for c in measured if c.unit == "m"]
+    angles = [noise[c.name] for c in measured if c.unit != "m"]
     values = [max(lengths, default=1.0)] * 3 + [max(angles, default=1.0)] * 3
     for name, value in noise.items():
         channel = {**_POSITION, **_TURN}.get(name)
@@ -295,7 +298,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         used = used_covariates(situation, acting)
         situation = replace(situation, covariates={n: v for n, v in situation.covariates.items() if n in used})
         if isinstance(situation.mechanism, Instrument):
-            situation = situation.whole
+            situation = situation.visits
             values = values[..., : len(situation.mechanism.geometry)]
         return found_block(situation, values, acting, covariate_units(situation.mechanism))
     except InputError:

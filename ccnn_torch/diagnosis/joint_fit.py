@@ -18,11 +18,11 @@ from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.diagnosis.candidates.atom import scales
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
 from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
-from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
+from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.rows import fitted_frames, in_groups
 from ccnn_torch.diagnosis.residual.whitening import Whitening, device_axes, moving_channels, renewed
-from ccnn_torch.effects import Acting, Effect, Situation, measured_channels
+from ccnn_torch.effects import Acting, Effect, Situation, measured_channels, moved
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.evidence.priors import EFFECT
 from ccnn_torch.mechanisms import Mechanism

@@ -21,6 +21,7 @@ from ccnn_torch.evidence.dictionary import FittedSet, covariance
 from ccnn_torch.evidence.sets import scored
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.designs import Candidates
+from ccnn_torch.records.commanded import SECOND
 
 _CANDIDATES = 400
 _WANTED = 8
@@ -147,6 +148,8 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
         order = torch.argsort(covariates["time"])
         covariates = {n: v[order] for n, v in covariates.items()}
         covariates["time"] = covariates["time"] + _APART * torch.arange(len(joints))
+    if len(here.places) > 1:
+        pose = here.pose[drawn[""]]
     there = Situation(mechanism, joints, covariates, here.gravity, parameters, pose)
     # A torque at rest is no choice, but what the joints and the load make it.
     return replace(there, covariates=covariates | torques_elsewhere(here, there))
@@ -204,7 +207,11 @@ def _chosen(situation: Situation, questions: list[_Question]) -> list[dict[str, 
     taken.sort(key=lambda pair: -float(alone[pair[1], pair[0]]))
     return [
         {
-            "joints": {j.name: float(situation.joints[k, i]) for i, j in enumerate(mechanism.joints)},
+            "joints": {
+                f"{j.name}{ending}": float(place.joints[k, i])
+                for ending, place in zip(("", SECOND), situation.places, strict=False)
+                for i, j in enumerate(mechanism.joints)
+            },
             "covariates": {n: float(v[k]) for n, v in situation.covariates.items() if n not in left},
             "separates": questions[number].names,
             "gain": float(alone[number, k]),

@@ -82,8 +82,8 @@ class Compliance(Effect):
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """A load that was measured."""
-        there = any(f"load_{c.name}" in covariates for c in mechanism.pose)
-        along = " or ".join(f"load_{c.name}[{'N' if c.unit == 'm' else 'N*m'}]" for c in mechanism.pose)
+        there = any(f"load_{c.name}" in covariates for c in inside(mechanism).pose)
+        along = " or ".join(f"load_{c.name}[{'N' if c.unit == 'm' else 'N*m'}]" for c in inside(mechanism).pose)
         return "" if there else f"a column of the load on the platform: {along}"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:

@@ -392,6 +392,15 @@ class Mechanism(nn.Module):
         """How many of the pose coordinates are measured; further ones say what a row's measurement was of."""
         return len(self.pose)
 
+    def places(self, joints: Tensor, rows: Tensor | None) -> list[Tensor]:
+        """Joints of each place that rows are of, `... x n` each [SI]: as a rule these, in one.
+
+        Args:
+            joints: commanded, `... x n` [SI].
+            rows: as recorded, `... x p` [SI].
+        """
+        return [joints]
+
     @property
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Box of poses that samples are drawn from: low and high, `p` each [SI]."""

@@ -105,6 +105,8 @@ def remaining_gain(
         "reason": "",
     }
     chance = float(before.std()) / math.sqrt(len(before))
+    if len(analysis.situation.places) > 1:
+        return block | {"reason": "each row is of two places, and a network has the joints of one"}
     # Noise that was estimated is what a fit left: only noise that was given says that nothing is left.
     if white.known > 0 and float(before.mean()) < noise + _CHANCE * chance:
         return block | {"reason": "what the effects leave is no more than the noise"}

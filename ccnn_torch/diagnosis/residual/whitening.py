@@ -131,7 +131,7 @@ def moving_channels(situation: Situation) -> Tensor:
     if sees_directions(situation.mechanism):
         return torch.arange(2)
     slope = torch.nan_to_num(situation.frame_slope).square().mean((0, 2))
-    units = [c.unit for c in situation.mechanism.pose]
+    units = [c.unit for c in situation.mechanism.pose[: situation.mechanism.compared]]
     kinds = [(slope[:3], units.count("m"), 0), (slope[3:], units.count("rad"), 3)]
     chosen = [kind.argsort(descending=True, stable=True)[:count] + first for kind, count, first in kinds]
     return torch.cat(chosen).sort().values
