@@ -163,7 +163,8 @@ def test_structured_text_is_parsed_and_gives_the_numbers(arrays: bool, monkeypat
     form, golden = made(compensator, dtype, sd=arrays)
     files = print_structured_text(form, golden)
     assert (" DO" in files["compensator.st"].partition("CCNN_Compensate")[0]) == arrays
-    blocks = parse_blocks(files["compensator.st"] + files["selftest.st"])
+    # The parser takes seconds: the test of itself, alike for all models, is read once.
+    blocks = parse_blocks(files["compensator.st"] + files["selftest.st"] * arrays)
     rows, more = len(golden.joints), {"covariates": golden.covariates.T} if form.covariates else {}
     with np.errstate(all="ignore"):
         compensate, ideal = (Instance(blocks, name, rows) for name in ("CCNN_Compensate", "CCNN_Ideal"))
@@ -175,10 +176,11 @@ def test_structured_text_is_parsed_and_gives_the_numbers(arrays: bool, monkeypat
             spread = Instance(blocks, "CCNN_DeviationSd", rows)
             spread(command=golden.joints.T, **more)
             found["sd"] = spread.values["sd"].T
-        test = Instance(blocks, "CCNN_SelfTest", 1)
-        test()
+        if arrays:
+            test = Instance(blocks, "CCNN_SelfTest", 1)
+            test()
+            assert bool(test.values["passed"][0]) and test.values["failed"][0] == 0
     assert {k: v for k, v in golden.errors(found).items() if v > 1} == {}
-    assert bool(test.values["passed"][0]) and test.values["failed"][0] == 0
     assert "status" in blocks["ccnn_compensate"].declarations[1].items[-1].variables[0].variable.name
 
 
