@@ -20,6 +20,21 @@ class Coordinate:
         return f"{self.name}[{self.unit}]"
 
 
+def torque_of(joint: Coordinate) -> str:
+    """The column of a drive's force or torque at rest."""
+    return f"torque_{joint.name}"
+
+
+def force_of(unit: str) -> str:
+    """Unit of the force or moment along a coordinate of this unit."""
+    return "N" if unit == "m" else "N*m"
+
+
+def per_force(unit: str) -> str:
+    """Unit of a compliance of a joint of this unit."""
+    return f"{unit}/{'N' if unit == 'm' else 'N/m'}"
+
+
 @dataclass(frozen=True)
 class Condition(Coordinate):
     """A covariate that a simulator takes, with its SI value for records without that column.

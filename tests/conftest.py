@@ -1,4 +1,4 @@
-"""What all tests share: one thread, and the command line in this process.
+"""What all tests share: one thread, blank figures, and the command line in this process.
 
 One thread: the tensors are small, and threads of two processes would wait for each other.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # Before numpy is loaded, which reads it once; processes that tests start inherit it.
@@ -16,6 +16,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from ccnn_torch.cli import main
 
@@ -28,6 +29,19 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     # And rarely at what is new: 700 new objects, Python's own threshold, are made by one operation on tensors.
     gc.set_threshold(50_000, 10, 10)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _blank_figures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Figures are made and written, but blank: drawing them is a third of a run with a page.
+
+    Not in tests/report, nor in a module that says `DRAWN = True`.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if "report" not in request.path.parts and not hasattr(request.module, "DRAWN"):
+            patch.setattr(Figure, "draw", lambda figure, renderer: None)
+            patch.setattr(Figure, "get_layout_engine", lambda figure: None)
+        yield
 
 
 @pytest.fixture

@@ -8,9 +8,10 @@ import onnx
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation.targets.onnx_export import rows_apart_from, traced
+from ccnn_torch.compensation.targets.onnx_export import rows_apart_from
 from ccnn_torch.compensation.targets.onnx_graph import Graph
 from ccnn_torch.compensation.targets.onnx_operations import ByTensors
+from ccnn_torch.compensation.targets.recording import recorded
 
 
 def to_onnx(module: torch.nn.Module, inputs: Mapping[str, Tensor], outputs: Sequence[str]) -> onnx.ModelProto:
@@ -18,5 +19,5 @@ def to_onnx(module: torch.nn.Module, inputs: Mapping[str, Tensor], outputs: Sequ
     rows = rows_apart_from(module)
     graph = Graph(rows, 20)
     given = [graph.input(name, row.shape[1], "batch") for name, row in inputs.items()]
-    found = ByTensors(graph).run(traced(module, *(row[:1].repeat(rows, 1) for row in inputs.values())), given)
+    found = ByTensors(graph).run(recorded(module, [row[:1].repeat(rows, 1) for row in inputs.values()]), given)
     return graph.model(dict(zip(outputs, found, strict=True)), "batch", "module")

@@ -125,6 +125,32 @@ def test_slopes_are_those_of_finite_differences(kernel: str) -> None:
         torch.testing.assert_close(slope[:, k], difference, rtol=1e-6, atol=1e-7)
 
 
+def test_steps_are_those_of_rprop_with_one_step_size_a_number() -> None:
+    data, settings = wavy(1, 15), GPSettings(tolerance=0.0)
+    learner = GaussianProcess(settings)
+    learner.start(data)
+    theta = [[float(v) for v in row] for row in learner.state_dict()["theta"][0]]
+    sizes, before = [[[start] * 5 for _ in theta] for start in (settings.learning_rate, 0.0)]
+    turned = 0
+    for _ in range(25):
+        targets = data.targets[0].mT
+        at = torch.tensor(theta, dtype=torch.float64)
+        rows = data.inputs.expand(2, -1, -1)
+        slopes = log_evidence(settings.kernel, FLOOR, at, rows, targets, data.weights.expand(2, -1)).slope.tolist()
+        for o, row in enumerate(slopes):
+            for k, slope in enumerate(row):
+                same = slope * before[o][k]
+                factor = 1.2 if same > 0 else 0.5 if same < 0 else 1.0
+                sizes[o][k] = min(max(sizes[o][k] * factor, 1e-4), 1.0)
+                # Where the slope has changed its sign it stays, and the next step is of the size that it has.
+                before[o][k] = 0.0 if same < 0 else slope
+                theta[o][k] += math.copysign(sizes[o][k], slope) * (before[o][k] != 0)
+                turned += same < 0
+        learner.step()
+        np.testing.assert_allclose(learner.state_dict()["theta"][0], theta, rtol=0, atol=1e-9)
+    assert turned > 5
+
+
 def test_a_row_of_weight_two_is_that_row_twice() -> None:
     once = wavy(1, 30)
     once.weights[:, :10] = 2

@@ -19,6 +19,9 @@ from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.planning.job import make_plan
 from ccnn_torch.records import load_records, read_table
 
+# Its figures are looked at.
+DRAWN = True
+
 Cli = Callable[..., tuple[int, str, str]]
 FAST = ("candidates=200", "noise=1e-4")
 

@@ -21,6 +21,9 @@ from ccnn_torch.report.results.run import RunResults
 from ccnn_torch.study.suite import compare, load_suite, run_suite, write_suite
 from ccnn_torch.study.suite_page import suite_page
 
+# Its figures are looked at.
+DRAWN = True
+
 ROOT = Path(__file__).parent.parent
 TINY = """
 base:

@@ -23,6 +23,9 @@ from ccnn_torch.records import write_table
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.verification.promise import configurations, paired_gain, promise_block, promised, repeated
 
+# Its figures are looked at.
+DRAWN = True
+
 Cli = Callable[..., tuple[int, str, str]]
 NOTHING = {"geometry": "none", "effects": "none"}
 DELTA = "delta"

@@ -244,6 +244,10 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
         inputs = inputs[:, [*range(n), *(n + k for k in kept)]]
         covariates = tuple(covariates[k] for k in kept)
         scaling = scaling.of_inputs(inputs)
+        for second in prepared.mechanism.places(inputs[:, :n], prepared.pose[repeat, there])[1:]:
+            # Trusted where either place of a row was.
+            inputs = torch.cat([inputs, torch.cat([second, inputs[:, n:]], -1)])
+            deviations = deviations.repeat(2, 1)
     names = [c.name for c in covariates]
     physics = {} if prepared.physics is None else prepared.physics.modules(repeat, there, margin, names)
     if physics and "machine" not in physics and limit is None:

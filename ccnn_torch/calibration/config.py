@@ -164,8 +164,8 @@ class RunConfig(JobConfig):
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
     covariates: Names | None = Field(
         default=None,
-        description="inputs beside the joints, names or patterns; null = time, temperature, load_*, direction*, "
-        "speed* where they are there; [] = none",
+        description="inputs beside the joints, names or patterns; null = time, temperature, load_*, torque_*, "
+        "direction*, speed* where they are there; [] = none",
     )
     split: SplitConfig = Field(default_factory=SplitConfig)
     case: Literal["tripod", "machine_tool", "realistic"] | None = Field(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +15,7 @@ from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import PoseError, Seen
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.records.commanded import SECOND
 
 # The fixed point q = q* - δ(q) gains a factor of the Lipschitz constant of δ each time, about 1e-3 for real machines.
 _COMMAND_ITERATIONS = 8
@@ -109,27 +110,25 @@ def _of_records(
         found, without = [], str(reason)
     left, reached, damped = [], [], 0.0
     for k in repeats:
-        joints, covariates = prepared.joints[k], prepared.covariates[k]
-        if found:
-            names = [c.name for c in found[k].covariates]
-            covariates = covariates[:, [c.name in names for c in prepared.covariate_coordinates]]
-        measured = _vectors(prepared, prepared.pose[k])
+        joints, measured = prepared.joints[k], _vectors(prepared, prepared.pose[k])
+        visited = zip(_places(prepared, k), ("", SECOND), strict=False)
+        places = [(q, _covariates(prepared, k, found, ending)) for q, ending in visited]
         with torch.no_grad():
-            learned = found[k].learned(joints, covariates) if found else deviation[k]
-        rest = _apart(measured, _model(prepared, k, joints + learned))
+            learned = [q + (found[k].learned(q, c) if found else deviation[k]) for q, c in places]
+        rest = _apart(measured, _model(prepared, k, *learned))
         left.append(rest)
         if not found:
             reached.append(rest)
             continue
         with torch.no_grad():
-            solved = found[k].solve(joints, covariates)
-            moved = solved.command + found[k].learned(solved.command, covariates)
+            solved = [found[k].solve(q, c) for q, c in places]
+            moved = [s.command + found[k].learned(s.command, c) for s, (_, c) in zip(solved, places, strict=True)]
         given = _given(prepared)
         about = (_wanted(prepared, k), None if given is None else given[k])
         nominal = prepared.mechanism.forward_kinematics(joints, *about)
         wanted = _vectors(prepared, nominal)
-        reached.append(_apart(_model(prepared, k, moved), wanted) + rest)
-        damped += float((solved.status == 3).double().mean()) / len(prepared.joints)
+        reached.append(_apart(_model(prepared, k, *moved), wanted) + rest)
+        damped += float((solved[0].status == 3).double().mean()) / len(prepared.joints)
     explained, after = _error(torch.stack(left)), _error(torch.stack(reached))
     return Outcome(fitted, deviation, score, explained, after, None, tuple(found), without, damped)
 
@@ -139,7 +138,7 @@ def pose_with_effects(prepared: Prepared) -> PoseError | None:
     if prepared.physics is None or not prepared.physics.source:
         return None
     rows = [
-        _apart(_vectors(prepared, prepared.pose[k]), _model(prepared, k, prepared.joints[k]))
+        _apart(_vectors(prepared, prepared.pose[k]), _model(prepared, k, *_places(prepared, k)))
         for k in range(len(prepared.joints))
     ]
     return _error(torch.stack(rows))
@@ -165,11 +164,25 @@ def _wanted(prepared: Prepared, repeat: int) -> Tensor | None:
     return torch.cat([nominal[..., :inner], own.expand(*nominal.shape[:-1], -1)], -1)
 
 
-def _model(prepared: Prepared, repeat: int, moved: Tensor) -> Tensor:
-    """Frame of the model's pose at command and what was learned there, `s x n`, as `_vectors`."""
+def _places(prepared: Prepared, repeat: int) -> list[Tensor]:
+    """Joints of each place that the rows are of, `s x n` each."""
+    return prepared.mechanism.places(prepared.joints[repeat], prepared.pose[repeat])
+
+
+def _covariates(prepared: Prepared, repeat: int, found: Sequence[Compensator], ending: str) -> Tensor:
+    """What the compensator asks for in one of the places, all without one, `s x m`; ending: of that place's columns."""
+    names = [c.name for c in prepared.covariate_coordinates]
+    asked = [c.name for c in found[repeat].covariates] if found else names
+    columns = [names.index(f"{n}{ending}" if f"{n}{ending}" in names else n) for n in asked]
+    return prepared.covariates[repeat][:, columns]
+
+
+def _model(prepared: Prepared, repeat: int, moved: Tensor, *second: Tensor) -> Tensor:
+    """Frame of the model's pose at command and what was learned there, `s x n`, as `_vectors`; second: likewise."""
     if prepared.physics is not None:
-        return prepared.physics.frames(repeat, moved)
+        return prepared.physics.frames(repeat, moved, *second)
     guess = completed(prepared.mechanism, moved, prepared.pose[repeat], _parameters(prepared, repeat))
+    guess = torch.cat([guess[..., : prepared.mechanism.compared], *second], -1) if second else guess
     return _vectors(prepared, prepared.mechanism.forward_kinematics(moved, _parameters(prepared, repeat), guess))
 
 

@@ -54,7 +54,7 @@ class DiagnoseConfig(JobConfig):
     )
     covariates: Names | None = Field(
         default=None,
-        description="covariate columns by name or pattern; null = time, temperature, load_*, direction*, …",
+        description="covariate columns by name or pattern; null = time, temperature, load_*, torque_*, direction*, …",
     )
     noise: Annotated[Noise | None, BeforeValidator(_deviation)] = Field(
         default=None,

@@ -270,7 +270,7 @@ def why_set_aside(analysis: Analysis, rows: PlausibleRows, chosen: Tensor) -> di
     """Reason by row, counted from 0 in the file; rows: all of them; chosen: those evaluated."""
     why = dict.fromkeys(torch.nonzero(~rows.fine).squeeze(-1).tolist(), "the machine does not reach it")
     why |= dict.fromkeys(torch.nonzero(rows.astray).squeeze(-1).tolist(), "far from where its joints put it")
-    aside, near = analysis.whitening.weight <= 0, analysis.near_singular
+    aside, near = ~analysis.whitening.counted, analysis.near_singular
     why |= dict.fromkeys(chosen[aside & ~near].tolist(), "far from what any fit to the other rows says")
     return why | dict.fromkeys(chosen[aside & near].tolist(), "next to a singularity")
 
@@ -279,7 +279,7 @@ def gross_outliers(analysis: Analysis) -> Tensor:
     """Rows set aside that are so far off that no heavy tail of ordinary noise makes them, `s` bool."""
     white = analysis.whitening
     size = (white.picked(analysis.residual) / white.sigma).abs().amax(-1)
-    aside = (white.weight <= 0) & ~analysis.near_singular
+    aside = ~white.counted & ~analysis.near_singular
     far = aside & (size > _GROSS_TOGETHER)
     together = int(far.sum()) > max(1.0, _SHARE_TOGETHER * len(far))
     return far if together else aside & (size > _GROSS)

@@ -23,7 +23,7 @@ from ccnn_torch.diagnosis.from_file import (
     usable_verdict,
 )
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
-from ccnn_torch.diagnosis.mount import SET_ANEW, mount_notes
+from ccnn_torch.diagnosis.mount import SET_ANEW, frames_taken, mount_notes
 from ccnn_torch.diagnosis.residual.distance import size_of
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, noise_of_columns
 from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
@@ -37,6 +37,7 @@ from ccnn_torch.effects.time import ROW, FrameDrift, elapsed
 from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import (
     BlackBox,
+    Framed,
     Instrument,
     Mechanism,
     SerialArm,
@@ -100,7 +101,8 @@ def diagnose(
         )
     mounted = mount_notes(said, mounts, _word(situation))
     notes = [*records.missing, *said.notes, *mounted, *_unread(records, situation, said)]
-    said = replace(said, lines=tuple(records.lines.tolist())).with_entries(notes=notes, machine=named_machine(said))
+    entries = {"notes": notes, "machine": named_machine(said), "frames": frames_taken(said)}
+    said = replace(said, lines=tuple(records.lines.tolist())).with_entries(**entries)
     return with_network(said, seed) if network else said
 
 
@@ -118,7 +120,7 @@ def _mounts(records: Records, situation: Situation) -> dict[str, Tensor]:
 
 def _word(situation: Situation) -> str:
     """What a group of rows is called."""
-    return next(iter(getattr(situation.mechanism, "frame_per", ())), "")
+    return next(iter(situation.mechanism.frame_per), "")
 
 
 def _instrument(records: Records, situation: Situation) -> Noise | None:
@@ -130,7 +132,7 @@ def _unread(records: Records, situation: Situation, said: Diagnosis) -> list[str
     """A note of columns that no effect uses: one of them may be misnamed."""
     mechanism = situation.mechanism
     known = [*DEFAULT_COVARIATES, *situation.covariates, *(condition.name for condition in mechanism.takes)]
-    known += [*mechanism.frame_per, *mechanism.tool_per] if isinstance(mechanism, SerialArm) else []
+    known += [*mechanism.frame_per, *mechanism.tool_per]
     known += [FILE] if records.parts else []
     known += [name for c in mechanism.pose for name in column_names(c.name)] if said.noise == "columns" else []
     names = [name for name in records.columns if not any(fnmatchcase(name, pattern) for pattern in known)]
@@ -220,31 +222,34 @@ def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) ->
     if noise is None:
         return None
     count = situation.jacobian.shape[-2]
-    names = [c.name for c in situation.mechanism.pose]
+    pose, measured = situation.mechanism.pose, situation.mechanism.pose[: situation.mechanism.compared]
+    names = [c.name for c in measured]
     if isinstance(noise, str):
         raise InputError(
             f"noise: '{noise}' is a text; give a number in SI (1e-5), or one for each of {', '.join(names)}"
         )
     if not isinstance(noise, Mapping):
         noise = dict.fromkeys(names, float(noise))
-    wrong = [n for n in noise if n not in names]
+    # What an instrument was pointed at needs none.
+    wrong = [n for n in noise if all(n != c.name for c in pose)]
     missing = [n for n in names if n not in noise]
     if wrong or missing:
         said = f"there is no pose coordinate {wrong[0]}" if wrong else f"gives nothing for {', '.join(missing)}"
         raise InputError(f"noise: {said}; the pose is {', '.join(names)}")
+    noise = {n: noise[n] for n in names}
     low = [n for n, v in noise.items() if not 0 < float(v) < float("inf")]
     if low:
         raise InputError(f"noise: must be above 0, not {noise[low[0]]!r} for {low[0]}")
     spread = float(size_of(situation).place)
-    wide = [c.name for c in situation.mechanism.pose if c.unit == "m" and noise[c.name] > spread]
+    wide = [c.name for c in measured if c.unit == "m" and noise[c.name] > spread]
     if wide:
         value = noise[wide[0]]
         raise InputError(
             f"noise: {value:.4g} m for {wide[0]} is more than {situation.mechanism.name} moves (its poses are spread "
             f"over {spread:.3g} m); write the unit, e.g. {value:g}um"
         )
-    lengths = [v for n, v in noise.items() if n in _POSITION]
-    angles = [v for n, v in noise.items() if n not in _POSITION]
+    lengths = [noise[c.name] for c in measured if c.unit == "m"]
+    angles = [noise[c.name] for c in measured if c.unit != "m"]
     values = [max(lengths, default=1.0)] * 3 + [max(angles, default=1.0)] * 3
     for name, value in noise.items():
         channel = {**_POSITION, **_TURN}.get(name)
@@ -285,7 +290,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
             situation = in_time(situation, elapsed(next(times)))
             known.append(frame_drift(situation, drift))
         loose = loose_parameters(situation.mechanism, identify)
-        fine = (analysis.whitening.weight > 0) & ~analysis.near_singular
+        fine = analysis.whitening.counted & ~analysis.near_singular
         acting, values = fit_jointly(situation, analysis.measured, known, fine, loose)
         acting = [a for a in acting if a.effect.name != FrameDrift.name]
         if grouped:
@@ -293,7 +298,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         used = used_covariates(situation, acting)
         situation = replace(situation, covariates={n: v for n, v in situation.covariates.items() if n in used})
         if isinstance(situation.mechanism, Instrument):
-            situation = situation.whole
+            situation = situation.visits
             values = values[..., : len(situation.mechanism.geometry)]
         return found_block(situation, values, acting, covariate_units(situation.mechanism))
     except InputError:
@@ -315,12 +320,17 @@ def _in_link_frames(situation: Situation) -> Situation:
 
 
 def _in_own_base(situation: Situation, values: Tensor) -> tuple[Situation, Tensor]:
-    """An arm of which groups of rows have base frames, without these, and its parameters so; values: in one group."""
-    arm, parameters = situation.mechanism, situation.parameters
-    assert isinstance(arm, SerialArm) and parameters is not None
-    plain: dict[str, Any] = {"frame_per": [], "tool_per": [], "unknown_frames": [], "tool_offset": None}
+    """A machine of which groups of rows have base frames, without these, and its parameters so; values: of one."""
+    machine, parameters = situation.mechanism, situation.parameters
+    assert parameters is not None
     none = torch.zeros(6, dtype=values.dtype)
-    alone = SerialArm(**{**arm.recipe["keys"], **plain}).with_nominal(torch.cat([none, parameters[0, 6:]]))
+    if isinstance(machine, SerialArm):
+        plain: dict[str, Any] = {"frame_per": [], "tool_per": [], "unknown_frames": [], "tool_offset": None}
+        one: Mechanism = SerialArm(**{**machine.recipe["keys"], **plain})
+    else:
+        assert isinstance(machine, Framed)
+        one = Framed(machine.mechanism, True, machine.tool, machine.rotation_weight)
+    alone = one.with_nominal(torch.cat([none, parameters[0, 6:]]))
     down = rotation_vector_to_matrix(parameters[0, 3:6]).mT @ situation.gravity
     return replace(situation, mechanism=alone, parameters=None, gravity=down), torch.cat([none, values[6:]])
 

@@ -18,11 +18,11 @@ from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.diagnosis.candidates.atom import scales
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
 from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
-from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
+from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.rows import fitted_frames, in_groups
 from ccnn_torch.diagnosis.residual.whitening import Whitening, device_axes, moving_channels, renewed
-from ccnn_torch.effects import Acting, Effect, Situation, measured_channels
+from ccnn_torch.effects import Acting, Effect, Situation, measured_channels, moved
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.evidence.priors import EFFECT
 from ccnn_torch.mechanisms import Mechanism
@@ -67,7 +67,7 @@ def fit_jointly(
     for turn in range(_ROUNDS + 1):
         rows = model.about(at, measured, usable)
         white = rows.whitening() if white is None else white
-        white = replace(white, weight=torch.where(rows.fine, white.weight, 0.0))
+        white = replace(white, weight=torch.where(rows.fine[:, None], white.weight, 0.0))
         if before is not None and white(rows.left).square().sum() > white(before[0]).square().sum():
             # A step that leads away from the rows.
             at = before[1]
@@ -248,7 +248,7 @@ class _Rows:
         white = fitted_whitening(self.target, columns, channels, None, self.fine, self.seen, device_axes(here))
         left = white.picked(self.left) / white.sigma
         near = inlying(left.norm(dim=-1), self.fine, len(white.channels), 0)
-        return replace(white, weight=(self.fine & near).to(left.dtype))
+        return replace(white, weight=(self.fine & near)[:, None].expand_as(left).to(left.dtype))
 
     def grams(self, white: Whitening) -> Grams:
         return grams_of(white(self.columns), white(self.target))._replace(

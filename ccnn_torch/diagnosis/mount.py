@@ -1,4 +1,4 @@
-"""How the mount of a machine that shows directions stands, in each group of rows."""
+"""How the mount of a machine that shows directions stands, by group of rows; what an arm's fitted frames took."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from torch import Tensor
 from ccnn_torch.diagnosis.residual.rows import in_groups
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.display import number_text
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_unknown, sees_directions
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 SET_ANEW = ("geometry", "joint_offset", "flexure")
 """Effects that may be others after a mount was set up anew."""
@@ -57,3 +59,33 @@ def _turn(said: Diagnosis, frame: Tensor) -> Tensor:
 
 def _arc(angle: Tensor) -> str:
     return f'{number_text(float(angle) / _ARCSECOND, 3)}"'
+
+
+def machine_as_told(said: Diagnosis) -> Mechanism | None:
+    """The machine with the verdict's numbers in it and its unknown frames fitted again; None with frames by group."""
+    situation = said.analysis.situation
+    mechanism, frames = situation.mechanism, situation.parameters
+    if frames is not None and frames.dim() > 1:
+        return None
+    named = [e["parameters"] for e in said.effects if e["name"] in said.verdict["effects"]]
+    found = {n: b["value"] for parameters in named for n, b in parameters.items() if b.get("nominal") is not None}
+    change = torch.tensor([found.get(p.name, 0.0) for p in mechanism.geometry], dtype=torch.float64)
+    machine = mechanism.with_nominal(mechanism.nominal + change)
+    fitted = fit_unknown(machine, situation.joints, said.analysis.measured)
+    return machine if fitted is None else machine.with_nominal(fitted)
+
+
+def frames_taken(said: Diagnosis) -> dict[str, list[float]]:
+    """Of an arm's fitted base and tool frame how far it is from the model's: shift [m] and rotation vector [rad]."""
+    arm = said.analysis.situation.mechanism
+    if not isinstance(arm, SerialArm) or not arm.unknown_frames or sees_directions(arm):
+        return {}
+    machine, taken = machine_as_told(said), {}
+    if machine is None:
+        return {}
+    for name in arm.unknown_frames:
+        part = slice(0, 6) if name == "base" else slice(-6, None)
+        before, after = arm.nominal[part], machine.nominal[part]
+        turn = rotation_vector_to_matrix(after[3:]) @ rotation_vector_to_matrix(before[3:]).mT
+        taken[name] = [*(after - before)[:3].tolist(), *matrix_to_rotation_vector(turn).tolist()]
+    return taken

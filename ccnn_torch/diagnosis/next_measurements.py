@@ -9,16 +9,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import torque_of
 from ccnn_torch.diagnosis.candidates.atom import scaled_signature
 from ccnn_torch.diagnosis.residual.rows import frame_columns, in_groups
 from ccnn_torch.diagnosis.residual.whitening import device_axes
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Situation
+from ccnn_torch.effects.covariates import torques_elsewhere
 from ccnn_torch.evidence.dictionary import FittedSet, covariance
 from ccnn_torch.evidence.sets import scored
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.designs import Candidates
+from ccnn_torch.records.commanded import SECOND
 
 _CANDIDATES = 400
 _WANTED = 8
@@ -126,13 +129,16 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
     here = analysis.situation
     mechanism, generator = here.mechanism, torch.Generator().manual_seed(seed)
     pose: Tensor | None = None
+    # Of frames by group those of the first row: the next rows are measured in that group.
+    parameters = here.parameters if here.parameters is None or here.parameters.dim() == 1 else here.parameters[0]
     if type(mechanism).sample_joints is not Mechanism.sample_joints:
         # Nothing tells what an arm may touch but where it has been; through its poses its joints would turn many times.
         low, high = here.joints.amin(0), here.joints.amax(0)
         joints = low + (high - low) * torch.rand(_CANDIDATES, len(low), generator=generator, dtype=low.dtype)
-    elif here.parameters is not None:
-        pose = mechanism.sample_workspace(_CANDIDATES, generator)
-        joints = mechanism.solve_inverse(pose, here.parameters)
+    elif parameters is not None:
+        # A machine that is framed has its workspace where its frames are.
+        pose = mechanism.with_nominal(parameters).sample_workspace(_CANDIDATES, generator)
+        joints = mechanism.solve_inverse(pose, parameters)
     else:
         joints = mechanism.sample_joints(_CANDIDATES, generator)
     drawn = {k: torch.randint(len(here.joints), (len(joints),), generator=generator) for k in (*_KINDS, "")}
@@ -142,9 +148,11 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
         order = torch.argsort(covariates["time"])
         covariates = {n: v[order] for n, v in covariates.items()}
         covariates["time"] = covariates["time"] + _APART * torch.arange(len(joints))
-    # Of frames by group those of the first row: the next rows are measured in that group.
-    parameters = here.parameters if here.parameters is None or here.parameters.dim() == 1 else here.parameters[0]
-    return Situation(mechanism, joints, covariates, here.gravity, parameters, pose)
+    if len(here.places) > 1:
+        pose = here.pose[drawn[""]]
+    there = Situation(mechanism, joints, covariates, here.gravity, parameters, pose)
+    # A torque at rest is no choice, but what the joints and the load make it.
+    return replace(there, covariates=covariates | torques_elsewhere(here, there))
 
 
 def _columns(analysis: Analysis, found: FittedSet, there: Situation) -> Tensor:
@@ -195,11 +203,16 @@ def _chosen(situation: Situation, questions: list[_Question]) -> list[dict[str, 
         for question in questions:
             question.candidates.change(best, 1)
     assert alone is not None
+    left = {"time", *map(torque_of, mechanism.joints)}
     taken.sort(key=lambda pair: -float(alone[pair[1], pair[0]]))
     return [
         {
-            "joints": {j.name: float(situation.joints[k, i]) for i, j in enumerate(mechanism.joints)},
-            "covariates": {n: float(v[k]) for n, v in situation.covariates.items() if n != "time"},
+            "joints": {
+                f"{j.name}{ending}": float(place.joints[k, i])
+                for ending, place in zip(("", SECOND), situation.places, strict=False)
+                for i, j in enumerate(mechanism.joints)
+            },
+            "covariates": {n: float(v[k]) for n, v in situation.covariates.items() if n not in left},
             "separates": questions[number].names,
             "gain": float(alone[number, k]),
         }

@@ -16,6 +16,7 @@ from ccnn_torch.evidence.shrink import Gap
 _NOTHING: dict[str, Any] = {
     **dict.fromkeys(("gap_rotation", "by_block", "network")),
     **{name: [] for name in ("missing_covariates", "rows_set_aside", "why_set_aside")},
+    "frames": {},
 }
 
 

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
         labelled as labelled,
         measured_channels as measured_channels,
         measured_pose as measured_pose,
+        moved as moved,
         moved_joints as moved_joints,
         pose_residual as pose_residual,
         reached as reached,

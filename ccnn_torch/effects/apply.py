@@ -39,14 +39,31 @@ def labelled(acting: Sequence[Acting]) -> list[tuple[str, Acting]]:
     return found
 
 
-def signature(situation: Situation, effect: Effect, shape: Tensor) -> Tensor:
-    """First-order change of position and rotation vector per unit of each coefficient, `... x s x c x m`."""
-    basis = effect.basis(situation, shape)
-    if effect.kind == "joints":
-        return situation.jacobian @ basis
+def signature(situation: Situation, effect: Effect, shape: Tensor, there: Situation | None = None) -> Tensor:
+    """First-order change of position and rotation vector per unit of each coefficient, `... x s x c x m`.
+
+    there: the same rows on the machine about which it is linear; that of the situation when None. Rows of two places
+    change by what the effect does at both.
+    """
+    there = there or situation
     if effect.kind == "parameters":
-        return situation.parameter_jacobian @ basis
-    return basis
+        return there.parameter_jacobian @ effect.basis(situation, shape)
+    each = [effect.basis(place, shape) for place in situation.places]
+    if effect.kind == "joints":
+        each = [place.jacobian @ basis for place, basis in zip(there.places, each, strict=True)]
+    return each[0] if len(each) == 1 else each[0] + each[1]
+
+
+def moved(situation: Situation, acting: Sequence[Acting], parameters: Tensor | None = None) -> Situation:
+    """The same rows with joints and parameters as the effects make them; parameters: as in `reached`."""
+    joints = [place.joints for place in situation.places]
+    parameters = situation.mechanism.resolve(situation.parameters if parameters is None else parameters)
+    for one in acting:
+        if one.effect.kind == "joints":
+            joints = [q + one.change(place) for q, place in zip(joints, situation.places, strict=True)]
+        elif one.effect.kind == "parameters":
+            parameters = parameters + one.change(situation)
+    return situation.moved(joints, parameters)
 
 
 def reached(situation: Situation, acting: Sequence[Acting], parameters: Tensor | None = None) -> Tensor:
@@ -61,20 +78,16 @@ def reached(situation: Situation, acting: Sequence[Acting], parameters: Tensor |
     Returns:
         The frame's position and rotation vector side by side, `... x s x c`: c = 3 without orientation, else 6.
     """
-    mechanism = situation.mechanism
-    joints, parameters = situation.joints, mechanism.resolve(situation.parameters if parameters is None else parameters)
+    there = moved(situation, acting, parameters)
+    position, rotation = situation.mechanism.frame(
+        situation.machine.forward_kinematics(there.joints, there.parameters, there.guess)
+    )
     for one in acting:
-        if one.effect.kind == "joints":
-            joints = joints + one.change(situation)
-        elif one.effect.kind == "parameters":
-            parameters = parameters + one.change(situation)
-    pose = situation.machine.forward_kinematics(joints, parameters, situation.pose)
-    position, rotation = mechanism.frame(pose)
-    moved = [one.change(situation) for one in acting if one.effect.kind == "pose"]
-    for change in moved:
-        position = position + change[..., :3]
-        if rotation is not None:
-            rotation = rotation_vector_to_matrix(change[..., 3:]) @ rotation
+        for place in situation.places if one.effect.kind == "pose" else ():
+            change = one.change(place)
+            position = position + change[..., :3]
+            if rotation is not None:
+                rotation = rotation_vector_to_matrix(change[..., 3:]) @ rotation
     if rotation is None:
         return position
     return torch.cat([position, matrix_to_rotation_vector(rotation)], -1)

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one, per_force
-from ccnn_torch.effects.loads import SCALE
+from ccnn_torch.coordinates import per_force
+from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms.frames.giving import GIVE
 
 _SCALE = {"m": 1.5e-4, "rad": 2e-4}
 # Pushes at which a joint leaves its flank, in units of the usual one; and how soft the change is.
@@ -114,7 +115,7 @@ class Friction(Effect):
         """By load (where one was recorded), by weight, constant: for each joint whose direction is known."""
         found = []
         for joint in (situation.mechanism.joints[i] for i in situation.directed):
-            size = SCALE[joint.unit] * _SHARE
+            size = GIVE[joint.unit] * _SHARE
             for part in ("load", "weight") if situation.loaded else ("weight",):
                 found.append(
                     Coefficient(f"{joint.name} {part}", per_force(joint.unit), size, joint=joint.name, positive=True)

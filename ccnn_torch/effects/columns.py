@@ -46,11 +46,6 @@ def of_rows(values: Tensor, rows: Tensor | None, dim: int = -2) -> Tensor:
     return values if rows is None else values.index_select(dim, rows)
 
 
-def per_force(unit: str) -> str:
-    """Unit of a compliance of a joint of this unit."""
-    return f"{unit}/{'N' if unit == 'm' else 'N/m'}"
-
-
 def inside(mechanism: Mechanism) -> Mechanism:
     """The machine itself, of which perhaps not all is measured."""
     return mechanism.mechanism if isinstance(mechanism, Seen) else mechanism

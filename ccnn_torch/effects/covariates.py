@@ -8,7 +8,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import force_of, torque_of
 from ccnn_torch.effects.columns import inside
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.effects.time import REFERENCE, ROW
 from ccnn_torch.mechanisms import Mechanism
 
@@ -71,9 +73,34 @@ def directions(joints: Tensor, before: Tensor) -> dict[str, Tensor]:
     return {f"direction{i + 1}": sign for i, sign in enumerate(signs.unbind(-1))}
 
 
+def rest_torques(situation: Situation) -> dict[str, Tensor]:
+    """`torque_NAME` of each joint, `... x s` [N or N·m]: what 100 N of own weight and the load put on it at rest."""
+    torques = PLATFORM_WEIGHT * situation.own_weight_torque + situation.load_torque
+    return {torque_of(j): torques[..., i] for i, j in enumerate(situation.mechanism.joints)}
+
+
+def torques_elsewhere(rows: Situation, there: Situation) -> dict[str, Tensor]:
+    """The torques at rest that other rows of a machine have, `t` each, by name, as far as columns of rows `s` tell.
+
+    Each joint's by least squares: a constant, what its own weight, spread in two ways, and the load put on it.
+    """
+
+    def causes(at: Situation) -> Tensor:
+        parts = [torch.ones_like(at.joints), at.own_weight_torque, at.weight_torque, at.load_torque]
+        return torch.stack(parts, -1).movedim(-2, 0)
+
+    found, known, new = {}, causes(rows), causes(there)
+    for joint, here, other in zip(rows.mechanism.joints, known, new, strict=True):
+        if (name := torque_of(joint)) in rows.covariates:
+            shares = torch.linalg.lstsq(here, rows.covariates[name][:, None], driver="gelsd").solution
+            found[name] = (other @ shares)[:, 0]
+    return found
+
+
 def covariate_units(mechanism: Mechanism) -> dict[str, str]:
     """SI unit of every column that the library's effects know, or the machine itself takes, by name."""
     units = {c.name: c.unit for c in mechanism.takes} | {"time": "s", ROW: "1", "temperature": "K"}
-    units |= {f"load_{c.name}": "N" if c.unit == "m" else "N*m" for c in inside(mechanism).pose}
+    units |= {f"load_{c.name}": force_of(c.unit) for c in inside(mechanism).pose}
+    units |= {torque_of(j): force_of(j.unit) for j in mechanism.joints}
     units |= {f"direction{i + 1}": "1" for i in range(len(mechanism.joints))}
     return units | {f"speed{i + 1}": f"{j.unit}/s" for i, j in enumerate(mechanism.joints)}

@@ -8,10 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.columns import by_joint, inside, own_parameters, per_force
+from ccnn_torch.coordinates import force_of, per_force, torque_of
+from ccnn_torch.effects.columns import by_joint, inside, own_parameters
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm, sees_directions
+from ccnn_torch.mechanisms.frames.giving import GIVE
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 
@@ -57,8 +59,6 @@ def arm_axes(arm: SerialArm, joints: Tensor, values: Tensor) -> tuple[Tensor, Te
     return points, axes
 
 
-SCALE = {"m": 1e-7, "rad": 2e-6}
-"""Plausible compliance of a drive: 1e-7 m/N (10 N/µm), 2e-6 rad/(N·m)."""
 _SECONDARY = 0.3
 # How far from the measured point a load may act [m].
 _AWAY = 0.1
@@ -82,8 +82,8 @@ class Compliance(Effect):
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """A load that was measured."""
-        there = any(f"load_{c.name}" in covariates for c in mechanism.pose)
-        along = " or ".join(f"load_{c.name}[{'N' if c.unit == 'm' else 'N*m'}]" for c in mechanism.pose)
+        there = any(f"load_{c.name}" in covariates for c in inside(mechanism).pose)
+        along = " or ".join(f"load_{c.name}[{'N' if c.unit == 'm' else 'N*m'}]" for c in inside(mechanism).pose)
         return "" if there else f"a column of the load on the platform: {along}"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
@@ -93,7 +93,7 @@ class Compliance(Effect):
             Coefficient(
                 f"{j.name}{part}",
                 per_force(j.unit),
-                SCALE[j.unit] * (_SECONDARY if part else 1.0),
+                GIVE[j.unit] * (_SECONDARY if part else 1.0),
                 joint=j.name,
                 secondary=bool(part),
                 positive=not part,
@@ -102,14 +102,14 @@ class Compliance(Effect):
             for j in mechanism.joints
         ]
         if isinstance(mechanism, SerialArm):
-            tilt, away = SCALE["rad"] * _SECONDARY, SCALE["rad"] * _AWAY
+            tilt, away = GIVE["rad"] * _SECONDARY, GIVE["rad"] * _AWAY
             turning = [mechanism.joints[i].name for i in _turning(mechanism)]
             return (
                 *found,
                 *(Coefficient(f"{j.name} tilt", "rad/N/m", tilt, j.name, None, True) for j in mechanism.joints),
                 *(Coefficient(f"{j} load {axis}", "rad/N", away, j, None, True) for j in turning for axis in "xyz"),
             )
-        stretch = SCALE["m"] * _SECONDARY
+        stretch = GIVE["m"] * _SECONDARY
         return (*found, *(Coefficient(m.name, "m/N", stretch, m.joint, m.leg, True) for m in members(mechanism)))
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
@@ -120,6 +120,39 @@ class Compliance(Effect):
         parts = [jacobian * (torque * ratio**k).unsqueeze(-2) for k in range(3)]
         arm = isinstance(situation.mechanism, SerialArm)
         return torch.cat([*parts, *_of_an_arm(situation)] if arm else [*parts, _stretching(situation)], -1)
+
+
+class Sag(Effect):
+    """Δq_i = c_i τ_i, τ = force or torque of each drive as measured at rest.
+
+    c is negative where the controller tells the torque with which a drive holds, and positive where it tells that of
+    the weight and load that it holds.
+    """
+
+    name = "sag"
+    kind = "joints"
+    description = "joints that give under their own torque, as measured at rest"
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """A torque that was measured."""
+        there = any(torque_of(j) in covariates for j in mechanism.joints)
+        one = mechanism.joints[0]
+        return "" if there else f"a column of the drives' torques: {torque_of(one)}[{force_of(one.unit)}]"
+
+    def _measured(self, situation: Situation) -> list[int]:
+        joints = situation.mechanism.joints
+        return [i for i, j in enumerate(joints) if torque_of(j) in situation.covariates]
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """One for each joint whose torque was measured."""
+        joints = [situation.mechanism.joints[i] for i in self._measured(situation)]
+        return tuple(Coefficient(j.name, per_force(j.unit), GIVE[j.unit], joint=j.name) for j in joints)
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x m`."""
+        joints, zero = situation.mechanism.joints, torch.zeros_like(situation.joints[..., 0])
+        torques = [situation.covariates.get(torque_of(j), zero).expand_as(zero) for j in joints]
+        return by_joint(torch.stack(torques, -1).unsqueeze(-1), self._measured(situation))
 
 
 def _stretching(situation: Situation) -> Tensor:
@@ -191,7 +224,7 @@ class Gravity(Effect):
         mechanism, found = situation.mechanism, []
         for joint in mechanism.joints:
             turning = joint.unit == "rad"
-            unit, size = "rad/m" if turning else "m", SCALE[joint.unit] * PLATFORM_WEIGHT
+            unit, size = "rad/m" if turning else "m", GIVE[joint.unit] * PLATFORM_WEIGHT
             found.append(Coefficient(joint.name, unit, size, joint=joint.name, positive=True))
             parts = [("stiffening", unit, size)]
             if isinstance(inside(mechanism), SerialArm):
@@ -243,7 +276,7 @@ def _off_centre(situation: Situation) -> Tensor:
     rotation = situation.platform[1]
     assert rotation is not None
     moment = torch.linalg.cross(rotation.mT, situation.down.expand_as(rotation), dim=-1)
-    scale = torch.tensor([SCALE[j.unit] for j in situation.mechanism.joints], dtype=rotation.dtype)
+    scale = torch.tensor([GIVE[j.unit] for j in situation.mechanism.joints], dtype=rotation.dtype)
     jacobian = torch.nan_to_num(situation.whole.jacobian)
     torques: Tensor = jacobian[..., 3:, :].mT @ moment.mT
     return scale[:, None] * torques

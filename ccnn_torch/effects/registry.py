@@ -17,7 +17,7 @@ from torch import Tensor
 from ccnn_torch.effects.backlash import Backlash, Friction
 from ccnn_torch.effects.constant import Frame, Geometry, Instrument, Tool, parameter_causes
 from ccnn_torch.effects.joints import Coupling, JointGain, JointOffset, Transmission
-from ccnn_torch.effects.loads import Compliance, Gravity
+from ccnn_torch.effects.loads import Compliance, Gravity, Sag
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.effects.sky import Flexure
@@ -339,6 +339,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "backlash": Backlash,
     "friction": Friction,
     "compliance": Compliance,
+    "sag": Sag,
     "gravity": Gravity,
     "thermal": Thermal,
     "drift": Drift,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+from ccnn_torch.records.commanded import SECOND
 
 PLATFORM_WEIGHT = 100.0
 """Weight of a platform of which nothing is known [N]."""
@@ -70,14 +71,52 @@ class Situation:
         return replace(self, mechanism=machine.mechanism, guess=guess, parameters=inner)
 
     @cached_property
+    def places(self) -> list[Situation]:
+        """The rows; and where each is of two places of the machine, the same with the second one first.
+
+        Covariates are of both places, but those of which a column with the ending `_b` has the second place's.
+        """
+        joints = self.mechanism.places(self.joints, self.guess)
+        if len(joints) == 1:
+            return [self]
+        turned = torch.cat([self.pose[..., : self.mechanism.compared], self.joints], -1)
+        covariates = {n: self.covariates.get(f"{n}{SECOND}", v) for n, v in self.covariates.items()}
+        return [self, replace(self, joints=joints[1], guess=turned, covariates=covariates)]
+
+    @cached_property
+    def visits(self) -> Situation:
+        """The machine itself with its whole pose, in the first place of every row and then in the second ones."""
+        each = [place.whole for place in self.places]
+        if len(each) == 1:
+            return self.whole
+        covariates = {n: torch.cat([one.covariates[n] for one in each]) for n in self.covariates}
+        return replace(each[0], joints=torch.cat([one.joints for one in each]), covariates=covariates, guess=None)
+
+    def moved(self, joints: Sequence[Tensor], parameters: Tensor | None) -> Situation:
+        """The rows with other joints at each of their places, `... x s x n` [SI], and other parameters."""
+        guess = torch.cat([self.pose[..., : self.mechanism.compared], *joints[1:]], -1) if joints[1:] else self.pose
+        return replace(self, joints=joints[0], parameters=parameters, guess=guess)
+
+    @cached_property
     def pose(self) -> Tensor:
         """Nominal pose at the commanded joints, `... x s x p` [SI]."""
         return self.machine.forward_kinematics(self.joints, self.parameters, self.guess).detach()
 
     @cached_property
     def place(self) -> Tensor:
-        """Where in the workspace the rows are, `... x s x p` [SI]: `where_moved` of the nominal pose and the guess."""
+        """Where in the workspace the rows are, `... x s x p` [SI]: `where_moved` of the nominal pose and the guess.
+
+        Of rows of two places the nominal pose at the first.
+        """
+        if len(self.places) > 1:
+            return self.whole.pose
         return self.pose if self.guess is None else where_moved(self.pose, self.guess)
+
+    @property
+    def lengths(self) -> list[int]:
+        """Numbers of the coordinates of `place` that are lengths."""
+        mechanism = self.mechanism if len(self.places) == 1 else self.whole.mechanism
+        return [k for k, c in enumerate(mechanism.pose) if c.unit == "m"]
 
     @cached_property
     def jacobian(self) -> Tensor:

@@ -72,6 +72,12 @@ _WORDS = {
         "How far the part gives for each unit of load on it.",
         "Bearings, gear and bolts of {where}: what gives under load.",
     ),
+    "sag": Words(
+        "joint compliance under the torque of the drives",
+        "compliance",
+        "How far the joint gives for each unit of its torque; negative where that is what the drive holds with.",
+        "Gear, belt or screw of {where}: its stiffness, and whether the controller compensates it.",
+    ),
     "gravity": Words(
         "sag under the machine's own weight",
         "sag under the own weight",

@@ -74,8 +74,14 @@ def is_unexplained(dictionary: Dictionary, found: FittedSet, floor: float) -> bo
     """Whether a set leaves clearly more than the noise (`floor`) and the form errors of its effects."""
     count = dictionary.grams.values
     above = _mean_square(found, dictionary) - floor
-    allowed = DIRECTIONS * _form_error(found, dictionary) / count
+    allowed = DIRECTIONS * form_error_of(found, dictionary) / count
     return above > max(floor * _CLEARLY * math.sqrt(2 / count), allowed)
+
+
+def form_error_of(found: FittedSet, dictionary: Dictionary) -> float:
+    """Variance in every direction of what the effects of a set differ by, in units of the dictionary's noise."""
+    shares = [dictionary.atoms[i].form_error for i in found.members]
+    return form_variance(shares, found.energy, float(dictionary.grams.yy))
 
 
 def form_variance(shares: Sequence[float], energies: Sequence[float], most: float) -> float:
@@ -91,7 +97,7 @@ def form_variance(shares: Sequence[float], energies: Sequence[float], most: floa
 
 def _at_level(dictionary: Dictionary, best: FittedSet, floor: float, level: float) -> Posterior:
     noise = max(floor, _mean_square(best, dictionary))
-    variance = max(noise + level * _form_error(best, dictionary), math.ulp(1.0))
+    variance = max(noise + level * form_error_of(best, dictionary), math.ulp(1.0))
     weighed = with_noise(dictionary, variance)
     return Posterior(weighed, probable_sets(weighed), 1 / len(LEVELS), variance)
 
@@ -101,12 +107,6 @@ def _without_discrepancies(posterior: Posterior) -> Posterior:
     atoms = posterior.dictionary.atoms
     found = [f for f in posterior.found if not any(atoms[i].is_discrepancy for i in f.members)]
     return replace(posterior, found=found)
-
-
-def _form_error(found: FittedSet, dictionary: Dictionary) -> float:
-    """Variance in every direction of what the effects of a set differ by, in units of the dictionary's noise."""
-    shares = [dictionary.atoms[i].form_error for i in found.members]
-    return form_variance(shares, found.energy, float(dictionary.grams.yy))
 
 
 def _mean_square(found: FittedSet, dictionary: Dictionary) -> float:

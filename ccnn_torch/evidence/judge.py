@@ -81,7 +81,7 @@ def posterior(
 def judge(
     explanations: Sequence[Explanation[S]],
     every: Sequence[Explanation[S]],
-    is_explained: Callable[[Explanation[S]], bool] = lambda _: True,
+    rest_of: Callable[[Explanation[S]], tuple[str, ...] | None] = lambda _: None,
     of_classes: bool = False,
 ) -> Verdict[S]:
     """The verdict.
@@ -89,7 +89,7 @@ def judge(
     Args:
         explanations: of `posterior`; one of them has no driver.
         every: the same with those that are no candidates for a verdict, but can be mistaken for one.
-        is_explained: whether a set of the explanation leaves no more than the noise and its form errors.
+        rest_of: what the remainder of an explanation's set follows, () = nothing known; None = it is noise.
         of_classes: whether a name stays that is only sure as one of its class, unless the set without it is probable:
             where names have few forms. Where they have many, the class holds what corrects the form of another name.
     """
@@ -106,15 +106,14 @@ def judge(
     if outside:
         most = BESIDE_UNKNOWN if chosen.names else 1.0
         return Verdict(chosen, classes, min(unknown, most), outside, drivers)
-    if not is_explained(chosen):
-        # A set with a discrepancy term that does explain the data goes before one that does not. Where none does, what
-        # is only sure as one of a class is not named: the unknown cause can look like all of it.
+    if (rest := rest_of(chosen)) is not None:
+        # A set with a discrepancy term that leaves noise goes before one that does not. Where none does, what is only
+        # sure as one of a class is not named: the unknown cause can look like all of it.
         beside = [e for e in explanations if e.drivers]
         certain = frozenset(n for n in chosen.names if marginal(explanations, n) >= NAMED)
         same_names = (e for e in [*beside, *explanations] if e.names == certain)
-        other = next((e for e in beside if is_explained(e)), None) or next(same_names, chosen)
-        drivers = other.drivers or next((e.drivers for e in beside), ())
-        return Verdict(other, {}, BESIDE_UNKNOWN, True, drivers)
+        other = next((e for e in beside if rest_of(e) is None), None) or next(same_names, chosen)
+        return Verdict(other, {}, BESIDE_UNKNOWN, True, other.drivers or rest)
     inside = [e for e in explanations if not e.drivers]
     same = sum(e.probability for e in inside if is_same(e.names, chosen.names, classes))
     if chosen.names < likely:

@@ -8,9 +8,6 @@ from ccnn_torch.identification.identifiability import (
     what_is_known as what_is_known,
 )
 from ccnn_torch.identification.problems.constraints import (
-    distance_problem as distance_problem,
-    pair_problem as pair_problem,
-    plane_problem as plane_problem,
     scatter as scatter,
     socket_problem as socket_problem,
     tool_points as tool_points,

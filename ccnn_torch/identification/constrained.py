@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -21,9 +22,6 @@ from ccnn_torch.identification import (
     ParameterChoice,
     Problem,
     Progress,
-    distance_problem,
-    pair_problem,
-    plane_problem,
     reweighted,
     scatter,
     socket_problem,
@@ -32,14 +30,22 @@ from ccnn_torch.identification import (
     what_is_known,
 )
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig
-from ccnn_torch.identification.constrained_rows import ConstraintRows, Kind, poses_of, read_constraint, rows_of
+from ccnn_torch.identification.constrained_rows import (
+    ConstraintRows,
+    Kind,
+    placed,
+    poses_of,
+    read_by,
+    read_constraint,
+    rows_of,
+)
 from ccnn_torch.identification.measured import Kinematics, Measured, Rows, nominal_machine
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.poses import forward_problem
 from ccnn_torch.identification.problems.problem import joined
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
-from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, PoseError, SerialArm, fit_unknown
+from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, PoseError, SerialArm
 from ccnn_torch.mechanisms.frames.instrument import instrument
 from ccnn_torch.mechanisms.frames.readings import READINGS
 from ccnn_torch.records.commanded import read_joints
@@ -217,32 +223,26 @@ def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
             )
 
         return sockets
-    seconds, seen = rows.others, rows.seen
-    if seen is not None:
+
+    @lru_cache(maxsize=1)
+    def at(start: tuple[float, ...]) -> Mechanism:
+        """The machine and what reads it, where it suits these parameters."""
+        seen = read_by(rows, mechanism.with_nominal(torch.tensor(start, dtype=torch.float64)), about).seen
+        assert seen is not None
+        return seen
+
+    def read(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
+        seen = at(tuple(start.tolist()))
         # What an instrument adds to the machine's parameters comes behind them.
         own = seen.geometry[len(mechanism.geometry) :]
+        sizes = None if noise is None else sizes_of_pose(noise, seen.pose, "noise")
+        start = torch.cat([start, seen.nominal[len(start) :]])
+        choice = replace(choice, free=[*(choice.free or ()), *(p.name for p in own)])
+        # Held-out rows are in units of the noise, too.
+        problem = forward_problem(seen, rows.joints, rows.said, None, choice, sizes, start=start)
+        return replace(problem, weights=rows.weights[None])
 
-        def poses(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
-            sizes = None if noise is None else sizes_of_pose(noise, seen.pose, "noise")
-            start = torch.cat([start, seen.nominal[len(start) :]])
-            choice = replace(choice, free=[*(choice.free or ()), *(p.name for p in own)])
-            # Held-out rows are in units of the noise, too.
-            problem = forward_problem(seen, rows.joints, rows.said, None, choice, sizes, start=start)
-            return replace(problem, weights=rows.weights[None])
-
-        return poses
-    if seconds is not None:
-
-        def pairs(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
-            return pair_problem(mechanism, rows.joints, seconds, rows.said[:, 0], noise, rows.weights, choice, start)
-
-        return pairs
-    make = distance_problem if about.kind == "distances" else plane_problem
-
-    def build(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
-        return make(mechanism, rows.joints, rows.group, rows.said[:, 0], noise, rows.weights, choice, start)
-
-    return build
+    return read
 
 
 def _beside(config: IdentifyConfig, mechanism: Mechanism) -> tuple[list[Build], list[dict[str, Any]]]:
@@ -253,11 +253,11 @@ def _beside(config: IdentifyConfig, mechanism: Mechanism) -> tuple[list[Build], 
     for about in config.constraint.beside:
         if about.kind == "pose":
             seen = mechanism if about.instrument is None else _held_by(mechanism, about.instrument)
-            rows = _placed(poses_of(config, about.records, seen)[0])
+            rows = placed(poses_of(config, about.records, seen)[0])
         else:
             source = read_source(about.records, config.columns)
             table = read_joints(source, mechanism, config.joint_map, config.columns)
-            rows = rows_of(table, mechanism, about, torch.arange(len(table)))
+            rows = rows_of(table, mechanism, about)
         found.append(_builder(about, mechanism, rows))
         told.append({"rows": len(rows.joints), "unit": "rad" if _angles_alone(rows) else "m"})
     return found, told
@@ -268,14 +268,6 @@ def _held_by(mechanism: Mechanism, about: Mapping[str, Any]) -> Instrument:
     if not isinstance(kind, str):
         raise InputError(f"constraint.beside: instrument: write its kind, one of {', '.join(READINGS)}")
     return instrument(mechanism, kind, link, {k: v for k, v in about.items() if k not in ("kind", "link")})
-
-
-def _placed(rows: ConstraintRows) -> ConstraintRows:
-    """With what is unknown of an instrument fitted to its rows, links nominal."""
-    if not isinstance(rows.seen, Instrument):
-        return rows
-    fitted = fit_unknown(rows.seen, rows.joints, rows.said, rows.weights)
-    return rows if fitted is None else replace(rows, seen=rows.seen.with_nominal(fitted))
 
 
 def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> dict[str, float]:
@@ -337,9 +329,9 @@ def identify_by_constraint(
     """
     mechanism, notes = _machine(config)
     rows = read_constraint(config, mechanism, given)
-    rows = _placed(rows)
-    notes += [rows.seen.reading.note] if isinstance(rows.seen, Instrument) and rows.seen.reading.note else []
-    mechanism = rows.seen if isinstance(rows.seen, Instrument) else mechanism
+    if isinstance(mechanism, Instrument) and isinstance(rows.seen, Instrument):
+        mechanism = rows.seen
+        notes += [mechanism.reading.note] if mechanism.reading.note else []
     begun = time.perf_counter()
     others, told = _beside(config, mechanism)
     fit = fit_constraint(config, mechanism, rows, progress, others, [one["unit"] for one in told])
@@ -374,17 +366,18 @@ def identify_by_constraint(
 def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
     """The mechanism; of an arm one without frames per group, since the constraint has its own."""
     mechanism = nominal_machine(config)
+    assert config.constraint is not None
+    kinds = {config.constraint.kind, *(one.kind for one in config.constraint.beside)}
+    ignored = [key for key in ("frame_per", "tool_per") if getattr(mechanism, key)]
+    if ignored and ("pose" in kinds or not isinstance(mechanism, SerialArm)):
+        raise InputError(
+            f"{config.mechanism}: {ignored[0]}: poses beside a constraint are in the machine's own base; remove the "
+            "key and give poses in that base, or remove constraint to identify from poses of several set-ups"
+        )
     if not isinstance(mechanism, SerialArm):
         return (Framed(mechanism, base=False, tool=True) if config.frame.tool else mechanism), []
     if config.frame.tool:
         raise InputError("frame.tool: an arm has a tool offset of its own, which is identified anyway; remove the key")
-    ignored = [key for key in ("frame_per", "tool_per") if getattr(mechanism, key)]
-    assert config.constraint is not None
-    if ignored and "pose" in (config.constraint.kind, *(one.kind for one in config.constraint.beside)):
-        raise InputError(
-            f"{config.mechanism}: {ignored[0]}: poses beside a constraint are in the arm's own base; remove the "
-            "key and give poses in that base, or remove constraint to identify from poses of several set-ups"
-        )
     plain = mechanism.with_orientation("none")
     arm = SerialArm(**{**plain.recipe["keys"], "unknown_frames": [], "frame_per": [], "tool_per": []})
     said = f"{' and '.join(ignored)} of the mechanism count for nothing here: the constraint has its own placements."

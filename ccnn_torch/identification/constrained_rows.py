@@ -15,7 +15,9 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import BesideConfig, ConstraintConfig, IdentifyConfig
 from ccnn_torch.identification.measured import notes_of, split_records
-from ccnn_torch.mechanisms import Mechanism, as_measured
+from ccnn_torch.identification.problems.constraints import tool_points
+from ccnn_torch.mechanisms import Instrument, Mechanism, as_measured, fit_unknown
+from ccnn_torch.mechanisms.frames.readings import Between, Dial, Reading, Wire
 from ccnn_torch.records import Records, Table, load_records, stack_columns
 from ccnn_torch.records.commanded import SECOND, read_joints
 from ccnn_torch.records.load import read_source
@@ -33,14 +35,13 @@ class ConstraintRows:
 
     Attributes:
         joints: `s x n` [SI].
-        said: the constraint's value of each row, `s x o` [m]: the socket's place on the plate (o = 3), the distance,
-            or the reading (o = 1).
+        said: what is said of each row, `s x o` [SI]: the socket's place on the plate (o = 3), or what `seen` reads,
+            and after it what that was of.
         group: number of each row's placement, anchor or plane, `s`.
         labels: the meaning of each number: the grouping columns and their values.
         weights: `s` [1]; 1 = row to identify from, 0 = held-out row.
         data_hash: SHA-256 of the records.
-        others: joints of the second place of each row, `s x n` [SI], where distances are between two places.
-        seen: the mechanism as poses `s x p` in `said` show it; None where a constraint holds the tool.
+        seen: the mechanism as `said` shows it, what is unknown of an instrument fitted; None of sockets.
         notes: how the rows were read, one sentence each.
     """
 
@@ -50,14 +51,13 @@ class ConstraintRows:
     labels: dict[float, dict[str, float]]
     weights: Tensor
     data_hash: str
-    others: Tensor | None = None
     seen: Mechanism | None = None
     notes: tuple[str, ...] = ()
 
     @property
     def in_sockets(self) -> bool:
         """Whether what is said of a row is its socket's place."""
-        return self.seen is None and self.said.shape[-1] == 3
+        return self.seen is None
 
     @property
     def cell(self) -> Tensor:
@@ -76,12 +76,12 @@ def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given |
         rows, records = poses_of(config, source, mechanism)
         weights = torch.zeros(len(records), dtype=torch.float64)
         weights[split_records(config, records).train] = 1.0
-        return replace(rows, weights=weights)
+        return placed(replace(rows, weights=weights))
     if isinstance(source, Records):
         raise InputError("records: a constraint has columns of its own; give the path of its file, or a DataFrame")
     table = read_joints(read_source(source, config.columns), mechanism, config.joint_map, config.columns)
     there = _taking_part(table, about.where)
-    rows = rows_of(table, mechanism, about, there)
+    rows = _rows_of(table, mechanism, about, there)
     joints = rows.joints
     columns = {name: table.raw(name)[there.numpy()] for name in table.names}
     held = rows_of_test_file(config.split, table.parts)
@@ -90,16 +90,20 @@ def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given |
     weights = torch.zeros(len(joints), dtype=torch.float64)
     weights[train] = 1.0
     rows = replace(rows, weights=weights)
-    _check_cells(rows, about)
-    return rows
+    _check_cells(rows)
+    return read_by(rows, mechanism, about)
 
 
-def rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> ConstraintRows:
-    """The rows of a table that are numbered, all of weight 1."""
+def rows_of(table: Table, mechanism: Mechanism, about: Kind) -> ConstraintRows:
+    """All rows of a table, of weight 1."""
+    return read_by(_rows_of(table, mechanism, about, torch.arange(len(table))), mechanism, about)
+
+
+def _rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> ConstraintRows:
+    """The rows of a table that are numbered, all of weight 1, without what reads them."""
     joints = torch.from_numpy(stack_columns(table, mechanism.joints, _ANGLE_LIMIT))[there]
     second = [Coordinate(f"{j.name}{SECOND}", j.unit) for j in mechanism.joints]
     paired = about.kind == "distances" and any(c.name in table for c in second)
-    others = torch.from_numpy(stack_columns(table, second, _ANGLE_LIMIT))[there] if paired else None
     if paired and about.by is not None:
         raise InputError(
             f"constraint.by: {table.path} has distances between two places, {second[0].name} …, which no anchor "
@@ -111,8 +115,42 @@ def rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> C
         group, labels = _groups(table, about, there)
     said = torch.from_numpy(stack_columns(table, _said_columns(table, about)))[there]
     said = said if said.shape[-1] else torch.zeros(len(joints), 1, dtype=torch.float64)
+    seen = None if about.kind == "sockets" else mechanism
+    if seen is not None:
+        of = torch.from_numpy(stack_columns(table, second, _ANGLE_LIMIT))[there] if paired else group[:, None]
+        said = torch.cat([said, of], -1)
     weights = torch.ones(len(joints), dtype=torch.float64)
-    return ConstraintRows(joints, said, group, labels, weights, table.data_hash, others, notes=table.notes)
+    return ConstraintRows(joints, said, group, labels, weights, table.data_hash, seen, table.notes)
+
+
+def read_by(rows: ConstraintRows, mechanism: Mechanism, about: Kind) -> ConstraintRows:
+    """With the instrument that reads distances or heights, where it suits this machine."""
+    if about.kind in ("sockets", "pose"):
+        return rows
+    used, numbers = rows.weights > 0, [*rows.labels]
+    if about.kind == "plane":
+        at = tool_points(mechanism, rows.joints)
+        groups = [used & (rows.group == n) for n in numbers]
+        reading: Reading = Dial([_normal(at[mine], rows.said[mine, 0]) for mine in groups], numbers)
+    else:
+        paired = "pairs" in rows.labels[numbers[0]]
+        reading = Between(mechanism) if paired else Wire(numbers)
+    return placed(replace(rows, seen=Instrument(mechanism, reading)))
+
+
+def _normal(points: Tensor, readings: Tensor) -> list[float]:
+    """Of the plane near points `s x 3` [m], towards where the readings `s` rise."""
+    normal = torch.linalg.svd(points - points.mean(0), full_matrices=True)[2][-1]
+    rising = float(((points @ normal) * (readings - readings.mean())).sum())
+    return [float(v) for v in (-normal if rising < 0 else normal)]
+
+
+def placed(rows: ConstraintRows) -> ConstraintRows:
+    """With what is unknown of an instrument fitted to its rows, links nominal."""
+    if not isinstance(rows.seen, Instrument):
+        return rows
+    fitted = fit_unknown(rows.seen, rows.joints, rows.said, rows.weights)
+    return rows if fitted is None else replace(rows, seen=rows.seen.with_nominal(fitted))
 
 
 def _taking_part(table: Table, where: Mapping[str, float]) -> Tensor:
@@ -152,7 +190,7 @@ def _said_columns(table: Table, about: Kind) -> list[Coordinate]:
     return [Coordinate("reading", "m")] if "reading" in table else []
 
 
-def _check_cells(rows: ConstraintRows, about: ConstraintConfig) -> None:
+def _check_cells(rows: ConstraintRows) -> None:
     """Every place that a held-out row was held in must be known from other rows."""
     cell = rows.cell
     used = torch.zeros(int(cell.max()) + 1, dtype=torch.float64).index_add(0, cell, rows.weights)

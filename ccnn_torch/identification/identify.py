@@ -35,7 +35,7 @@ from ccnn_torch.identification.solve import (
     select,
     solver_of,
 )
-from ccnn_torch.mechanisms import Framed, Mechanism, Seen, SetUps
+from ccnn_torch.mechanisms import Framed, Giving, Mechanism, Seen, SetUps
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
@@ -96,7 +96,7 @@ class Identification:
 
 
 def _one(mechanism: Mechanism, values: Tensor) -> Mechanism:
-    return mechanism.one(values) if isinstance(mechanism, SetUps) else mechanism.with_nominal(values)
+    return mechanism.one(values) if isinstance(mechanism, SetUps | Giving) else mechanism.with_nominal(values)
 
 
 def prepare(config: IdentifyConfig, given: Given | None = None) -> tuple[Mechanism, Measured]:

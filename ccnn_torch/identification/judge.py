@@ -234,7 +234,7 @@ def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | 
             f"transfer: {mechanism.name} has no frame to be fitted anew; it takes a serial arm whose base_frame or "
             "tool_frame is unknown"
         )
-    if mechanism.frame_per or mechanism.tool_per:
+    if mechanism.grouped:
         raise InputError(
             "transfer: takes an arm with one frame for all rows; remove frame_per and tool_per, or transfer"
         )
@@ -251,7 +251,8 @@ def transferred(config: IdentifyConfig, elsewhere: Elsewhere, values: Tensor) ->
     """
     train, test = elsewhere.train, elsewhere.test
     errors = []
-    for nominal in (elsewhere.arm.nominal, values):
+    # What joints give under torques is no part of an arm.
+    for nominal in (elsewhere.arm.nominal, values[: len(elsewhere.arm.nominal)]):
         arm = elsewhere.arm.with_nominal(nominal)
         assert isinstance(arm, SerialArm)
         placed = fit_frames(arm, train.joints[0], train.observed[0], rotation_weight=config.rotation_weight)

@@ -13,11 +13,14 @@ from torch import Tensor
 
 from ccnn_torch.config.sizes import sizes_of_joints, sizes_of_pose
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
+from ccnn_torch.coordinates import force_of, torque_of
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.config import IdentifyConfig
+from ccnn_torch.identification.config import PER_LEG, IdentifyConfig
 from ccnn_torch.mechanisms import (
     Framed,
+    Giving,
     Mechanism,
+    Seen,
     SerialArm,
     as_measured,
     fit_frames,
@@ -29,6 +32,7 @@ from ccnn_torch.mechanisms import (
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Split
+from ccnn_torch.units import si_unit_of
 
 # Each round of `command` shrinks the remainder by about the relative size of the errors.
 _COMMAND_ROUNDS = 6
@@ -100,9 +104,9 @@ class Rows:
         """The rows of some machines."""
         return Rows(self.joints[machines], self.observed[machines])
 
-    def in_set_ups(self, numbers: Tensor) -> Rows:
-        """The rows of an arm in set-ups, whose numbers `s` are the last of the joints (`SetUps`)."""
-        return replace(self, joints=torch.cat([self.joints, numbers.to(self.joints.dtype)[None, :, None]], -1))
+    def with_more(self, columns: Tensor) -> Rows:
+        """The rows with further columns `s x m` behind their joints: the number of a set-up, torques."""
+        return replace(self, joints=torch.cat([self.joints, columns.to(self.joints.dtype)[None]], -1))
 
 
 @dataclass(frozen=True)
@@ -175,13 +179,26 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
     joint_noise = None
     if config.joint_noise is not None:
         joint_noise = sizes_of_joints(config.joint_noise, mechanism.joints, "joint_noise")
-    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+    if isinstance(mechanism, SerialArm | Framed) and mechanism.grouped:
         mechanism, number, groups = set_ups(mechanism, records.columns, len(records))
         _refuse_unseen(groups, split, records)
-        train, test = (rows.in_set_ups(number[i]) for rows, i in ((train, split.train), (test, split.test)))
+        train, test = (rows.with_more(number[i, None]) for rows, i in ((train, split.train), (test, split.test)))
         start = mechanism.parameters_of(start[0], number[split.train])[None]
         # The number of a set-up has no noise.
         joint_noise = None if joint_noise is None else torch.nn.functional.pad(joint_noise, (0, 1))
+    # Joints of measured poses are known as far as the torques do not move them.
+    by_joints = config.residual == "inverse" or config.per_leg or any(m.endswith(PER_LEG) for m in config.methods)
+    giving = [] if by_joints or isinstance(mechanism, Seen) else _torques(records, mechanism)
+    if giving:
+        far.append(
+            "Joints were identified to give under the torques of the records (compliance q1 …): identified.yaml is the "
+            "machine without torques, and commands that hold what joints give are those of ccnn diagnose or ccnn run."
+        )
+        torques = torch.stack([values for _, values in giving], -1)
+        mechanism = Giving(mechanism, [i for i, _ in giving])
+        train, test = (rows.with_more(torques[i]) for rows, i in ((train, split.train), (test, split.test)))
+        start = torch.nn.functional.pad(start, (0, len(giving)))
+        joint_noise = None if joint_noise is None else torch.nn.functional.pad(joint_noise, (0, len(giving)))
     return Measured(
         mechanism=mechanism,
         kinematics=Kinematics(mechanism),
@@ -200,7 +217,7 @@ def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) ->
     """Records that fit a mechanism, and the mechanism as it was measured there (of its pose all, or a part)."""
     records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
-    if not config.frame.base and not config.frame.tool:
+    if not isinstance(mechanism, Framed) or not mechanism.unknown_frames:
         check_rows(records, mechanism)
         _check_joints(records, mechanism)
     return records, mechanism
@@ -235,11 +252,28 @@ def _start(mechanism: Mechanism, rows: Rows, columns: Mapping[str, NDArray[np.fl
     columns: of the rows, which number the groups.
     """
     joints, pose, fitted = rows.joints[0], rows.observed[0], None
-    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+    if isinstance(mechanism, SerialArm) and mechanism.grouped:
         fitted = fit_frames(mechanism, joints, pose, columns=columns)
-    elif not isinstance(mechanism, Framed):
-        fitted = fit_unknown(mechanism, joints, pose)
+    else:
+        fitted = fit_unknown(mechanism, joints, pose, columns=columns)
     return (mechanism.nominal if fitted is None else fitted)[None].clone()
+
+
+def _torques(records: Records, mechanism: Mechanism) -> list[tuple[int, Tensor]]:
+    """Numbers of the joints whose torques at rest were recorded and vary, and these, `s` [N or N·m]."""
+    found = []
+    for i, joint in enumerate(mechanism.joints):
+        name, unit = torque_of(joint), force_of(joint.unit)
+        values = records.columns.get(name)
+        if values is None or np.ptp(values) == 0:
+            continue
+        if si_unit_of(records.units[name], name) != unit:
+            raise InputError(f"{records.path}: column '{name}' is in {records.units[name]}; write {name}[{unit}]")
+        empty = np.flatnonzero(~np.isfinite(values))
+        if len(empty):
+            raise InputError(f"{records.path}: column '{name}' is empty at {records.name_rows(empty)}; fill it in")
+        found.append((i, torch.from_numpy(values)))
+    return found
 
 
 def _refuse_unseen(groups: Sequence[tuple[str, Tensor]], split: Split, records: Records) -> None:

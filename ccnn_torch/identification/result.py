@@ -29,7 +29,7 @@ from ccnn_torch.identification.solve import (
     is_apart,
     pieces_of,
 )
-from ccnn_torch.mechanisms import PoseError, SerialArm, SetUps
+from ccnn_torch.mechanisms import Giving, PoseError, SerialArm, SetUps
 from ccnn_torch.verification.promise import configurations, of_whole, promise_block
 from ccnn_torch.version import __version__
 
@@ -228,7 +228,7 @@ def _method_block(measured: Measured, found: Found) -> dict[str, Any]:
 def promised(measured: Measured, found: Found) -> dict[str, Any] | None:
     """What the held-out rows promise for new ones; None with several machines, of which only one is written, and with
     frames by group of rows, which new rows have not."""
-    if measured.machines > 1 or isinstance(measured.mechanism, SetUps):
+    if measured.machines > 1 or isinstance(measured.mechanism, SetUps | Giving):
         return None
     about = measured.test.observed[0], measured.mechanism.pose
     before, after = (of_whole(part_of_error(e, 0), *about) for e in (found.before, found.after))

@@ -149,9 +149,8 @@ def _built(
 
 def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
     """The rows with those frames fitted that no maker can know: the search and "before" begin from there."""
-    if not (config.frame.base or config.frame.tool):
+    if not (config.frame.base or config.frame.tool) or not isinstance(measured.mechanism, Framed):
         return measured
-    assert isinstance(measured.mechanism, Framed)
     observed = measured.rows.observed
     whole = (~observed.isnan().any(-1)).to(observed.dtype)
     frame = measured.view.frame(observed.nan_to_num())

@@ -7,6 +7,7 @@ if TYPE_CHECKING:
     from ccnn_torch.mechanisms.dh_file import read_dh_file as read_dh_file, read_urdf as read_urdf
     from ccnn_torch.mechanisms.frames.fit import fit_frames as fit_frames
     from ccnn_torch.mechanisms.frames.framed import Framed as Framed
+    from ccnn_torch.mechanisms.frames.giving import Giving as Giving
     from ccnn_torch.mechanisms.frames.instrument import Instrument as Instrument, fit_unknown as fit_unknown
     from ccnn_torch.mechanisms.frames.judge import judge_frames as judge_frames
     from ccnn_torch.mechanisms.frames.partial import (

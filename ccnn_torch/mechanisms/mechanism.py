@@ -68,6 +68,7 @@ class Mechanism(nn.Module):
             in an exported graph: ``forward``, ``inverse``, or None.
         inverse_kinematics: child module around `solve_inverse`, the place for forward hooks.
         takes: covariates that the nominal machine itself depends on: a simulator's; () for all others.
+        frame_per, tool_per: columns of records that number groups of rows with a base or tool frame of their own.
     """
 
     nominal: Tensor
@@ -77,6 +78,8 @@ class Mechanism(nn.Module):
     home_joints: Tensor
     orientations: tuple[str, ...] = ()
     takes: tuple[Condition, ...] = ()
+    frame_per: tuple[str, ...] = ()
+    tool_per: tuple[str, ...] = ()
     closed_form: Literal["forward", "inverse"] | None = None
 
     def __init__(
@@ -380,9 +383,23 @@ class Mechanism(nn.Module):
         return torch.isfinite(self.solve_inverse(pose, parameters)).all(-1)
 
     @property
+    def grouped(self) -> bool:
+        """Whether groups of rows have frames of their own."""
+        return bool(self.frame_per or self.tool_per)
+
+    @property
     def compared(self) -> int:
         """How many of the pose coordinates are measured; further ones say what a row's measurement was of."""
         return len(self.pose)
+
+    def places(self, joints: Tensor, rows: Tensor | None) -> list[Tensor]:
+        """Joints of each place that rows are of, `... x n` each [SI]: as a rule these, in one.
+
+        Args:
+            joints: commanded, `... x n` [SI].
+            rows: as recorded, `... x p` [SI].
+        """
+        return [joints]
 
     @property
     def bounds(self) -> tuple[Tensor, Tensor]:

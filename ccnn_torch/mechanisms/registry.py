@@ -189,6 +189,8 @@ def _framed(
     tool: bool = False,
     rotation_weight: float = 0.04,
     keys: Mapping[str, Any] | None = None,
+    frame_per: Sequence[str] = (),
+    tool_per: Sequence[str] = (),
 ) -> Framed:
     """A mechanism by name or file with its keys, or by description, seen from a measuring frame."""
     for name, value in (("base", base), ("tool", tool)):
@@ -197,7 +199,7 @@ def _framed(
                 f"mechanism 'framed': {name} is true or false, whether that frame is fitted, not {value!r}; keys of "
                 "the mechanism inside go under keys: {mechanism: delta, keys: {base: 0.2}}"
             )
-    return Framed(_inside(mechanism, keys), base, tool, rotation_weight)
+    return Framed(_inside(mechanism, keys), base, tool, rotation_weight, frame_per, tool_per)
 
 
 def _inside(mechanism: str | Mapping[str, Any], keys: Mapping[str, Any] | None) -> Mechanism:
@@ -272,8 +274,8 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
             function that makes one.
         allow_code: run the Python file that an identified machine's mechanism file names.
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
-            framed: mechanism, its keys, base, tool; partial: mechanism, its keys, pose; instrument: mechanism, its
-            keys, kind, link, and those of the kind; …).
+            framed: mechanism, its keys, base, tool, frame_per, tool_per; partial: mechanism, its keys, pose;
+            instrument: mechanism, its keys, kind, link, and those of the kind; …).
 
     Raises:
         InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, a

@@ -296,14 +296,37 @@ def weighed(grams: Grams, sets: Sequence[Sequence[Tensor]], columns: int, varian
     """
     if variance is None:
         return fit_sets(grams, sets, 0.0)
+    return fit_sets(_under_noise(grams, columns, variance), sets, CERTAIN * grams.values)
+
+
+def evidences(models: Sequence[tuple[Grams, Sequence[Tensor]]], variance: float) -> list[float]:
+    """Log evidence of models that have columns of their own, all at once.
+
+    Args:
+        models: inner products as `weighed` takes them, and the groups of the columns that are fitted.
+        variance: of the noise.
+    """
+    apart = [_under_noise(grams, sum(map(len, groups)), variance) for grams, groups in models]
+    sets, at = list[list[Tensor]](), 0
+    for own, (_, groups) in zip(apart, models, strict=True):
+        sets.append([at + columns for columns in groups])
+        at += len(own.xy)
+    squares, products, sums, values = zip(*apart, strict=True)
+    blocks = torch.block_diag(*squares)  # type: ignore[no-untyped-call]
+    beside = Grams(blocks, torch.cat(products), torch.stack(sums), values[0])
+    found: list[float] = fit_sets(beside, sets, CERTAIN * values[0]).log_evidence.tolist()
+    return found
+
+
+def _under_noise(grams: Grams, columns: int, variance: float) -> Grams:
+    """Of the columns that are fitted alone, in units of a noise to which the others add."""
     g = scaled(grams, variance)
     across = torch.cat([g.xx[columns:, :columns], g.xy[columns:, None]], -1)
     inner = g.xx[columns:, columns:] + torch.eye(len(across), dtype=across.dtype)
     taken = across.mT @ torch.linalg.solve(inner, across)
-    left = Grams(
+    return Grams(
         g.xx[:columns, :columns] - taken[:-1, :-1], g.xy[:columns] - taken[:-1, -1], g.yy - taken[-1, -1], g.values
     )
-    return fit_sets(left, sets, CERTAIN * grams.values)
 
 
 def deviations(fit: Fit, variance: float) -> Tensor:

@@ -21,7 +21,7 @@ from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.evidence.judge import judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets
 from ccnn_torch.evidence.priors import OUTSIDE, crowd
-from ccnn_torch.motion.fit import products, sensitivities, squares_unseen, weighed
+from ccnn_torch.motion.fit import evidences, products, sensitivities, squares_unseen
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, log_posterior
 from ccnn_torch.motion.spec import Fit, Spec
@@ -127,10 +127,8 @@ def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float
     """
 
     def under(variance: float) -> list[float]:
-        return [
-            float(weighed(one.grams, [one.groups], sum(map(len, one.groups)), variance).log_evidence[0]) + one.log_prior
-            for one in sets
-        ]
+        evidence = evidences([(one.grams, one.groups) for one in sets], variance)
+        return [found + one.log_prior for found, one in zip(evidence, sets, strict=True)]
 
     weights = under(noise + form)
     best = sets[weights.index(max(weights))]

@@ -14,8 +14,9 @@ from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.identifiability import combinations_in_words
 from ccnn_torch.identification.problems.problem import Problem, Progress
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Instrument, Mechanism
 from ccnn_torch.numerics.least_squares import jacobian_of
+from ccnn_torch.records.commanded import SECOND
 from ccnn_torch.spelling import nearest
 
 Limits = Mapping[str, tuple[float, float]]
@@ -121,7 +122,8 @@ def _draw(mechanism: Mechanism, count: int, generator: torch.Generator) -> tuple
         pose = mechanism.sample_workspace(count, generator)
         return mechanism.solve_inverse(pose), pose
     joints = mechanism.sample_joints(count, generator)
-    return joints, mechanism.forward_kinematics(joints)
+    given = mechanism.sample_given(count, generator) if isinstance(mechanism, Instrument) else None
+    return joints, mechanism.forward_kinematics(joints, guess=given)
 
 
 def _others(mechanism: Mechanism, uncertainty: Tensor | None) -> Tensor | None:
@@ -153,7 +155,9 @@ def _bounds(mechanism: Mechanism, limits: Limits) -> Tensor:
     """Lowest and highest value of joints and pose coordinates, `(n + p) x 2`."""
     names = [c.name for c in (*mechanism.joints, *mechanism.pose)]
     bounds = torch.tensor([-torch.inf, torch.inf], dtype=torch.float64).repeat(len(names), 1)
-    for name, (low, high) in limits.items():
+    # Those of a joint hold in the second place of a row, too, unless that has its own.
+    seconds = {f"{name}{SECOND}": ends for name, ends in limits.items() if f"{name}{SECOND}" in names}
+    for name, (low, high) in {**seconds, **limits}.items():
         if name not in names:
             near = nearest(name, names)
             hint = f"did you mean '{near}'?" if near else f"it has {', '.join(names)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.planning.page import plan_page, plan_plot
 from ccnn_torch.planning.program import program_text
 from ccnn_torch.records import write_table
+from ccnn_torch.records.commanded import SECOND
 from ccnn_torch.records.joint_map import JointMap, read_joint_map
 from ccnn_torch.report.figures.style import inline_svg, save_figure
 from ccnn_torch.report.page import InlineFigure, Section
@@ -103,12 +105,18 @@ def write_plan(
         columns |= {c.header: values[:, i].numpy() for i, c in enumerate(coordinates)}
     config = config or PlanConfig.from_file(None)
     counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
-    joints = np.stack([columns[joint.header] for joint in mechanism.joints], -1)
-    shown = joints if counted is None else counted.shown(joints)
-    columns |= {} if counted is None else _commands(shown, counted, mechanism, config)
+    places = []
+    for ending in ("", SECOND):
+        headers = [replace(joint, name=f"{joint.name}{ending}").header for joint in mechanism.joints]
+        if headers[0] in columns:
+            joints = np.stack([columns[header] for header in headers], -1)
+            places.append(joints if counted is None else counted.shown(joints))
+            columns |= {} if counted is None else _commands(places[-1], counted, mechanism, config, ending)
     program = None
     if config.program is not None:
-        program, suffix = program_text(config.program, path.stem, shown, mechanism.joints)
+        # The places of a row one after the other.
+        every = np.stack(places, 1).reshape(-1, len(mechanism.joints))
+        program, suffix = program_text(config.program, path.stem, every, mechanism.joints)
     make_folder(path.parent)
     write_table(path, columns)
     plot = plan_plot(mechanism.pose, plans, least_gain)
@@ -126,13 +134,15 @@ def write_plan(
     return files
 
 
-def _commands(shown: Array, counted: JointMap, mechanism: Mechanism, config: PlanConfig) -> dict[str, Array]:
-    """The joints as the controller counts them, `s x n` [SI], in the units of its columns."""
+def _commands(
+    shown: Array, counted: JointMap, mechanism: Mechanism, config: PlanConfig, ending: str
+) -> dict[str, Array]:
+    """The joints as the controller counts them, `s x n` [SI], in the units of its columns; ending: of their names."""
     units = dict(split_header(target) for target in config.columns.values())
     found = {}
     for k, (joint, column) in enumerate(zip(mechanism.joints, counted.columns, strict=True)):
         unit = units.get(column) or joint.unit
-        found[f"command_{joint.name}[{unit}]"] = from_si(shown[:, k], joint.unit, unit)
+        found[f"command_{joint.name}{ending}[{unit}]"] = from_si(shown[:, k], joint.unit, unit)
     return found
 
 

@@ -19,7 +19,7 @@ _EXTREME = 1e3
 # A column that varies by less than this share is constant but for how its numbers were written.
 _SAME = 1e-14
 
-DEFAULT_COVARIATES = ("time", "temperature", "load_*", "direction*", "speed*")
+DEFAULT_COVARIATES = ("time", "temperature", "load_*", "torque_*", "direction*", "speed*")
 
 
 def choose_covariates(
@@ -50,7 +50,7 @@ def choose_covariates(
         chosen = [name for name in free if _matches(name, wanted)]
     covariates, notes = [], []
     for name in chosen:
-        coordinate = Coordinate(name, _si_unit(name, table, pose))
+        coordinate = Coordinate(name, _si_unit(name, table, pose, {j.name: j.unit for j in joints}))
         values = table.column(name, coordinate.unit)
         _check_cell_sizes(values, name, table)
         if np.ptp(values) <= _SAME * max(np.abs(values).max(), 1.0):
@@ -106,19 +106,19 @@ def _matches_any(pattern: str, names: list[str]) -> bool:
     return any(fnmatchcase(name, pattern) for name in names)
 
 
-def _si_unit(name: str, table: Table, pose: Mapping[str, str]) -> str:
+def _si_unit(name: str, table: Table, pose: Mapping[str, str], joints: Mapping[str, str]) -> str:
     """SI unit of a covariate, whose dimension must fit a name that has a meaning."""
     where = f"{table.path}: column '{name}'"
     if not table.units[name]:
         parse_header(name, table.path)
     found = si_unit_of(table.units[name], where)
-    allowed = _allowed(name, pose)
+    allowed = _allowed(name, pose, joints)
     if allowed and found not in allowed:
         to_si([], table.units[name], allowed[0], where, name)
     return found
 
 
-def _allowed(name: str, pose: Mapping[str, str]) -> tuple[str, ...]:
+def _allowed(name: str, pose: Mapping[str, str], joints: Mapping[str, str]) -> tuple[str, ...]:
     if name == "time":
         return ("s",)
     if name == "temperature":
@@ -127,6 +127,8 @@ def _allowed(name: str, pose: Mapping[str, str]) -> tuple[str, ...]:
         # A force along a length, a moment about an angle; for another name either.
         unit = pose.get(name.removeprefix("load_"))
         return {"m": ("N",), "rad": ("N*m",)}.get(unit or "", ("N", "N*m"))
+    if name.startswith("torque_"):
+        return {"m": ("N",), "rad": ("N*m",)}.get(joints.get(name.removeprefix("torque_"), ""), ("N", "N*m"))
     if name.startswith("direction"):
         return ("1",)
     if name.startswith("speed"):

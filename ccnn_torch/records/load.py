@@ -196,8 +196,8 @@ def load_records(
     `qw, qx, qy, qz`, as Euler angles (`kuka_a, kuka_b, kuka_c`, `fanuc_w, fanuc_p, fanuc_r`,
     `staubli_rx, staubli_ry, staubli_rz`) or not at all; where a
     file has several, the first of these counts. The covariates are by default the columns `time`, `temperature`,
-    `load_*`, `direction*` and `speed*` that are there; `covariates` replaces this choice by names or patterns
-    ([] = none). A constant covariate is dropped with a note. A column that is not used needs no unit.
+    `load_*`, `torque_*`, `direction*` and `speed*` that are there; `covariates` replaces this choice by names or
+    patterns ([] = none). A constant covariate is dropped with a note. A column that is not used needs no unit.
 
     Args:
         source: a CSV file or an .xlsx workbook; several of them, whose rows are concatenated and whose

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ccnn_torch.config.sizes import Noise, noise_of_pose
 from ccnn_torch.effects import OUTLIER, Acting, Situation, default_gravity, measured_pose, reached
-from ccnn_torch.effects.covariates import covariate_units, directions, draw_covariates
+from ccnn_torch.effects.covariates import covariate_units, directions, draw_covariates, rest_torques
+from ccnn_torch.effects.loads import Sag
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import make_folder
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism, sees_directions
@@ -197,10 +198,14 @@ def simulate_records(
     generator = torch.Generator().manual_seed(seed)
     moving = config.rows == "trajectory" or (config.rows == "auto" and any(w.name == "latency" for w in wanted))
     joints, columns = (draw_moves if moving else draw_poses)(machine, rows, config, generator)
-    gravity = default_gravity(machine)
-    if config.gravity is not None:
-        gravity = torch.tensor(config.gravity, dtype=torch.float64)
-    situation = Situation(machine, joints, _kept(columns, config.covariates), gravity)
+    down = default_gravity(machine) if config.gravity is None else torch.tensor(config.gravity, dtype=torch.float64)
+    torques = any(w.name == Sag.name for w in wanted)
+
+    def situation_at(joints: Tensor) -> Situation:
+        rows = Situation(machine, joints, columns, down)
+        return replace(rows, covariates=_kept(columns | (rest_torques(rows) if torques else {}), config.covariates))
+
+    situation = situation_at(joints)
     acting = [act(w, situation, generator) for w in wanted if not w.outlier]
     check_bounds(situation, acting)
     frame = reached(situation, acting)
@@ -212,7 +217,7 @@ def simulate_records(
         joints = torch.where(lost[:, None], draw_poses(machine, rows, config, generator)[0], joints)
         first = torch.stack([columns[f"direction{i + 1}"][:1] for i in range(joints.shape[-1])], -1)
         columns |= directions(joints, first)
-        situation = replace(situation, joints=joints, covariates=_kept(columns, config.covariates))
+        situation = situation_at(joints)
         frame = reached(situation, acting)
         lost = ~torch.isfinite(frame).all(-1)
     if bool(lost.any()):

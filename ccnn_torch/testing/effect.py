@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, owned, reached, signature
-from ccnn_torch.effects.covariates import draw_covariates
+from ccnn_torch.effects.covariates import draw_covariates, rest_torques
 from ccnn_torch.effects.registry import OwnEffect, label_of, missing_on
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
@@ -79,7 +79,8 @@ def _situation(machine: Mechanism, seed: int) -> Situation:
     columns = draw_covariates(machine, joints, generator)
     speeds = torch.randn(joints.shape, generator=generator, dtype=torch.float64)
     columns |= {f"speed{i + 1}": 0.1 * speeds[:, i] for i in range(len(machine.joints))}
-    return Situation(machine, joints, columns, default_gravity(machine))
+    rows = Situation(machine, joints, columns, default_gravity(machine))
+    return replace(rows, covariates=columns | rest_torques(rows))
 
 
 def _shape(effect: Effect, situation: Situation) -> Tensor:

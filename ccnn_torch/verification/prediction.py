@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.compensation import LoadedModel
+from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
 from ccnn_torch.effects.columns import inside
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import (
@@ -29,6 +30,7 @@ from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.plugins import code_refused
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records
+from ccnn_torch.records.commanded import SECOND
 from ccnn_torch.records.headers import columns_there
 from ccnn_torch.records.joint_map import read_joint_map
 from ccnn_torch.records.load import read_source
@@ -104,33 +106,44 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
             )
     names = [c.name for c in records.pose_coordinates]
     pose = records.pose[:, [names.index(c.name) for c in machine.pose]]
-    found = model(records.joints.numpy(), _covariates(model, records))
-    ideal = torch.from_numpy(np.asarray(found["ideal"]))
     guess = completed(machine, records.joints, pose)
+    rows = Situation(machine, records.joints, _covariates(model, records), default_gravity(machine), None, guess)
+    found = [_found(model, place) for place in rows.places]
+    ideal = [torch.from_numpy(np.asarray(one["ideal"])) for one in found]
     nominal = machine.forward_kinematics(records.joints, guess=guess)
     if model.machine is not None:
-        real = model.machine.identified
-        real = (
-            machine.around(real) if isinstance(machine, Seen) else as_measured(real, machine.pose, records.path, pose)
+        nominal_of, real = (
+            machine.around(m) if isinstance(machine, Seen) else as_measured(m, machine.pose, records.path, pose)
+            for m in (model.machine.nominal, model.machine.identified)
         )
         predicted = real.forward_kinematics(records.joints, guess=guess)
+        if model.machine.acting:
+            here = replace(rows, mechanism=nominal_of, gravity=model.machine.gravity)
+            predicted = measured_pose(here, reached(here, model.machine.acting, real.nominal))
     else:
-        predicted = machine.forward_kinematics(ideal, guess=guess)
+        there = rows.moved(ideal, None)
+        predicted = machine.forward_kinematics(there.joints, guess=there.guess)
     lost = np.flatnonzero(~(torch.isfinite(nominal) & torch.isfinite(predicted)).all(-1).numpy())
     if len(lost):
         raise InputError(
             f"{records.path}: {machine.name} has no pose with the joints at {records.name_rows(lost)}; correct or "
             "remove them, or check the units"
         )
-    inside = torch.from_numpy(np.asarray(found["inside_domain" if compensated else "ideal_inside_domain"]))
-    return Rows(machine, records.joints, pose, ideal - records.joints, inside, nominal, predicted)
+    key = "inside_domain" if compensated else "ideal_inside_domain"
+    inside = torch.from_numpy(np.all([one[key] for one in found], axis=0))
+    return Rows(machine, records.joints, pose, ideal[0] - records.joints, inside, nominal, predicted)
 
 
-def _covariates(model: LoadedModel, records: Records) -> np.ndarray[Any, Any] | None:
-    """The model's covariates, `s x m` [SI], a constant one as well, which a run would have dropped."""
-    if not model.covariates:
-        return None
-    return np.stack([records.columns[c.name] for c in model.covariates], axis=-1)
+def _covariates(model: LoadedModel, records: Records) -> dict[str, Tensor]:
+    """The model's covariates, `s` each [SI], a constant one as well, which a run would have dropped."""
+    names = [f"{c.name}{ending}" for c in model.covariates for ending in ("", SECOND)]
+    return {n: torch.from_numpy(records.columns[n]) for n in names if n in records.columns}
+
+
+def _found(model: LoadedModel, rows: Situation) -> dict[str, np.ndarray[Any, Any]]:
+    """What the model says of rows."""
+    covariates = [rows.covariates[c.name].numpy() for c in model.covariates]
+    return model(rows.joints.numpy(), np.stack(covariates, axis=-1) if covariates else None)
 
 
 def pseudoerror_settings(model: LoadedModel, machine: Mechanism) -> dict[str, Any]:

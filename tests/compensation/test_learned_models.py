@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,7 +38,9 @@ def variance_of(network: nn.Module) -> Callable[[Tensor], Tensor]:
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_a_trained_model_goes_into_files_and_back(name: str, tmp_path: Path) -> None:
+def test_a_trained_model_goes_into_files_and_back(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Torch's compiler, 1.5 s of a process to load, is not needed.
+    monkeypatch.setitem(sys.modules, "torch._dynamo", None)
     joints = tripod_joints(60)
     generator = torch.Generator().manual_seed(4)
     deviations = 1e-4 * torch.sin(8 * joints) + 1e-5 * torch.randn(joints.shape, generator=generator).double()

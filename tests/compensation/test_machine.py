@@ -380,6 +380,10 @@ def test_the_whole_deviation_has_a_bound_of_its_own() -> None:
     bounded = (found.deviation.abs() == made.most).any(-1)
     assert bool(bounded.any()) and bool((found.status[bounded] == DAMPED).all())
     assert bool((made.limit < compensated("arm").most).all())
+    # Half as much again as the largest one that is needed where rows were measured and around, more than these show.
+    needed = solved(compensated("arm"), joints)
+    bound = compensated("arm").most / needed.deviation[needed.status <= 1].abs().amax(0)
+    assert bool((bound > 1.2).all()) and bool((bound < 3).all()), bound
 
 
 def test_which_machine_is_inverted_and_which_is_none() -> None:

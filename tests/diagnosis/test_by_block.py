@@ -38,12 +38,12 @@ def _by_least_squares(said: Diagnosis, nominal: torch.Tensor) -> list[tuple[floa
     """RMS of the position of each block without and with the verdict's effects, fitted to the other rows by numpy."""
     analysis, situation = said.analysis, said.analysis.situation
     keep, white = analysis.whitening.keep(), analysis.whitening
-    frames = frame_columns(situation, white.weight > 0)
+    frames = frame_columns(situation, white.counted)
     number = cut(situation.joints[keep], frames[keep]).numpy()
     atoms = [analysis.atoms[i] for i in said.judgement.found.members]
     effects = torch.cat([a.columns for a in atoms if a.name in said.verdict["effects"]], -1)
     channels = white.channels[white.channels < 3]
-    scale = (white.weight[keep].sqrt()[:, None] / white.sigma).numpy()
+    scale = white.scale[keep].numpy()
 
     def left(target: torch.Tensor, columns: torch.Tensor, block: int) -> float:
         y, x = target[keep][:, white.channels].numpy(), columns[keep][:, white.channels].numpy()

@@ -102,7 +102,7 @@ def test_only_names_that_do_something_have_joined_a_set() -> None:
 def test_a_fit_is_settled_where_noise_and_machine_are_as_the_linear_model_says() -> None:
     dictionary, y, found = looked_at()
     best = found[0]
-    old = Whitening(torch.arange(CHANNELS), torch.full((CHANNELS,), 2e-5), torch.ones(ROWS), 0.0)
+    old = Whitening(torch.arange(CHANNELS), torch.full((CHANNELS,), 2e-5), torch.ones(ROWS, CHANNELS), 0.0)
     linear = y - dictionary.columns[..., dictionary.groups[1]] @ best.mean[0]
     left = linear * old.sigma
 

@@ -123,10 +123,10 @@ def test_columns_that_are_missing_are_proposed_with_what_they_would_show() -> No
 
 def test_a_cause_that_nothing_recorded_shows_is_not_passed_off_as_noise() -> None:
     rows = rows_of("five_bar", 80, 2)
-    poses = measured(rows, {"backlash": 8.0}, 3)
+    poses = measured(rows, {"backlash": 5.0}, 4)
     bare = _without(rows, "load", "direction", "time", "temperature")
     guessed = diagnose_rows(bare, poses)
-    assert guessed.verdict["none"]
+    assert guessed.verdict["none"] and guessed.verdict["probability"] <= 0.6
     assert any("the noise was not given" in n and "direction1[1], direction2[1]" in n for n in guessed.notes)
     given = diagnose_rows(bare, poses, EXACT)
     assert given.verdict["outside_library"] and not given.verdict["none"]

@@ -27,7 +27,7 @@ def explained(shares: Shares) -> list[Explanation[str]]:
 def verdict(shares: Shares, *unexplained: str) -> Verdict[str]:
     """unexplained: sets that leave clearly more than the noise."""
     made = explained(shares)
-    return judge(made, made, lambda e: e.best not in unexplained)
+    return judge(made, made, lambda e: ("rest",) if e.best in unexplained else None)
 
 
 def said(found: Verdict[str]) -> tuple[set[str], float, bool, tuple[str, ...]]:
@@ -100,7 +100,7 @@ def test_a_set_that_leaves_more_than_the_noise_has_something_outside_beside_it()
     assert said(verdict(shares, "a")) == ({"b"}, 0.6, True, ("time",))
     assert said(verdict(shares, "a", "b|time")) == ({"a"}, 0.6, True, ("load x",))
     assert said(verdict(shares, *shares)) == ({"a"}, 0.6, True, ("load x",))
-    assert said(verdict({"a": 1.0}, "a")) == ({"a"}, 0.6, True, ())
+    assert said(verdict({"a": 1.0}, "a")) == ({"a"}, 0.6, True, ("rest",))
     # Neither b nor c is sure, though one of them is.
     either = {"a b": 0.5, "a c": 0.44, "a": 0.03, "a|time": 0.02, "b|load x": 0.01}
     assert said(verdict(either, *either)) == ({"a"}, 0.6, True, ("time",))

@@ -13,15 +13,15 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification import (
     ParameterChoice,
     Problem,
-    distance_problem,
-    plane_problem,
+    forward_problem,
     scatter,
     socket_problem,
     solve_lm,
     tool_points,
     what_is_known,
 )
-from ccnn_torch.mechanisms import SerialArm
+from ccnn_torch.mechanisms import Instrument, SerialArm
+from ccnn_torch.mechanisms.frames.readings import Between, Dial, Reading, Wire
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 HALF = math.pi / 2
@@ -113,6 +113,15 @@ def test_a_plate_that_was_printed_inexactly_has_its_own_scale() -> None:
         socket_problem(arm, joints, placement, printed, None, None, None, plate_tolerance=2e-4)
 
 
+def read(arm: SerialArm, reading: Reading, joints: Tensor, rows: Tensor, weights: Tensor | None = None) -> Problem:
+    """What an instrument reads with a noise of 0.1 um, its own unknowns fitted first."""
+    seen = Instrument(arm, reading)
+    seen = seen.with_nominal(seen.fitted(joints, rows, weights))  # type: ignore[assignment]
+    choice = replace(CHOICE, free=[*(CHOICE.free or ()), *(p.name for p in reading.parameters)])
+    problem = forward_problem(seen, joints, rows, None, choice, [1e-7] * len(seen.pose))
+    return problem if weights is None else replace(problem, weights=weights[None])
+
+
 def test_distances_from_an_unknown_anchor() -> None:
     arm, truth = machine()
     joints = arm.sample_joints(240, torch.Generator().manual_seed(2))
@@ -120,7 +129,7 @@ def test_distances_from_an_unknown_anchor() -> None:
     which = (torch.arange(240) % 2).to(torch.float64)
     distance = torch.linalg.vector_norm(tool_points(arm, joints, truth) - anchors[which.long()], dim=-1)
     weights = (torch.arange(240) < 200).to(torch.float64)
-    problem = distance_problem(arm, joints, which, distance, 1e-7, weights, CHOICE)
+    problem = read(arm, Wire([0, 1]), joints, torch.stack([distance, which], -1), weights)
     fit = solve_lm(problem)
     held = problem.residual(fit.values[:, None], *problem.data)[0, 200:, 0] * 1e-7
     start = problem.residual(problem.start[:, None], *problem.data)[0, 200:, 0] * 1e-7
@@ -137,12 +146,26 @@ def test_readings_above_an_unknown_plane(sign: float) -> None:
     points = tool_points(arm, joints, truth)
     near = (points @ normal).abs().argsort()[:160]
     joints, reading = joints[near], points[near] @ normal - 0.02
-    problem = plane_problem(arm, joints, torch.zeros(160, dtype=torch.float64), reading, 1e-7, None, CHOICE)
+    rows = torch.stack([reading, torch.zeros_like(reading)], -1)
+    problem = read(arm, Dial([normal.tolist()], [0]), joints, rows)
     fit = solve_lm(problem)
     left = problem.residual(fit.values[:, None], *problem.data) * 1e-7
     begin = problem.residual(problem.start[:, None], *problem.data) * 1e-7
     assert float(left.abs().max()) < 1e-6 < 1e-3 < float(begin.abs().max())
     assert float(fit.values[0, -3]) == pytest.approx(0.02, abs=1e-3)
+
+
+def test_distances_of_places_that_the_arm_reached_itself() -> None:
+    arm, truth = machine()
+    joints = arm.sample_joints(480, torch.Generator().manual_seed(2)).reshape(240, 2, 6)
+    ends = tool_points(arm, joints, truth)
+    rows = torch.cat([torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)[:, None], joints[:, 1]], -1)
+    weights = (torch.arange(240) < 200).to(torch.float64)
+    problem = read(arm, Between(arm), joints[:, 0], rows, weights)
+    assert [p.name for p in problem.parameters] == CHOICE.free
+    fit = solve_lm(problem)
+    held, start = (problem.residual(v[:, None], *problem.data)[0, 200:, 0] * 1e-7 for v in (fit.values, problem.start))
+    assert float(held.abs().max()) < 5e-6 < 1e-3 < float(start.abs().max())
 
 
 def test_what_a_point_cannot_tell_is_said() -> None:
@@ -166,16 +189,16 @@ def test_bad_input_is_one_sentence() -> None:
         socket_problem(arm, joints, placement[:5], points)
     with pytest.raises(InputError, match="points must be one place"):
         socket_problem(arm, joints, placement, points[:, :2])
-    with pytest.raises(InputError, match="placement 2: needs at least 1 row that count, got 0"):
+    with pytest.raises(InputError, match="placement 2: needs at least 1 row that counts, got 0"):
         socket_problem(arm, joints, placement, points, weights=(placement < 2).to(torch.float64))
     with pytest.raises(InputError, match="cannot determine"):
         socket_problem(arm, joints[:6], placement[:6], points[:6])
     with pytest.raises(InputError, match="noise: 0 is no standard deviation"):
         socket_problem(arm, joints, placement, points, 0.0)
-    with pytest.raises(InputError, match="anchor 0: needs at least 4 rows that count, got 3"):
-        distance_problem(arm, joints[:3], placement[:3], points[:3, 0])
-    with pytest.raises(InputError, match="at least 4 rows"):
-        plane_problem(arm, joints[:3], placement[:3])
+    rows = torch.stack([points[:3, 0], placement[:3]], -1)
+    for reading, name in ((Wire([0]), "anchor"), (Dial([[0, 0, 1]], [0]), "plane")):
+        with pytest.raises(InputError, match=f"{name} 0: needs at least 4 rows that count, got 3"):
+            read(arm, reading, joints[:3], rows)
     with pytest.raises(InputError, match=r"parameters\.prior"):
         socket_problem(arm, joints, placement, points, None, None, replace(CHOICE))
     with pytest.raises(InputError, match="no row that counts"):

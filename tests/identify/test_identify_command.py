@@ -19,6 +19,9 @@ from ccnn_torch.identification.page import write_identified_report
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
 
+# Its figures are looked at.
+DRAWN = True
+
 CONFIG = """\
 mechanism: five_bar
 simulate: {machines: 3, poses: 20, noise: 1e-6, circle: true, test_poses: 12, counts: [16], map: 9,

@@ -302,6 +302,8 @@ def test_poses_are_planned_for_an_instrument(tmp_path: Path, keys: dict[str, Any
     _, plans = make_plan(machine, 24, PlanConfig.from_file(None, ["candidates=60"]))
     assert plans[0].joints.shape == (24, 6) and len(torch.unique(plans[0].joints, dim=0)) == 24
     assert bool(torch.isfinite(plans[0].pose).all())
+    if keys["kind"] == "wire":
+        assert set(plans[0].pose[:, 1].tolist()) == {1.0, 2.0}
 
 
 def test_a_model_is_verified_by_the_pixels_of_another_day(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_a_group_without_rows_to_identify_from_is_refused(tmp_path: Path) -> Non
     split = {"kind": "column", "by": "station", "test_values": [2]}
     with pytest.raises(InputError, match=r"station 2 has \d+ held-out rows but none to identify from"):
         ccnn_torch.identify(**keys, split=split)
-    with pytest.raises(InputError, match="frame_per: poses beside a constraint are in the arm's own base"):
+    with pytest.raises(InputError, match="frame_per: poses beside a constraint are in the machine's own base"):
         ccnn_torch.identify(**keys, constraint={"kind": "pose"})
     with pytest.raises(InputError, match="transfer: takes an arm with one frame"):
         ccnn_torch.identify(**keys, transfer=keys["records"])

@@ -103,6 +103,18 @@ def test_the_numbers_to_enter_are_nominal_plus_error_with_their_digits() -> None
     assert numbers_table(_with("backlash", {"q1": (2e-7, 1e-6, "rad", "joint 1")}), 6) is None
 
 
+def test_numbers_that_do_not_repair_the_model_are_not_to_be_entered() -> None:
+    """Two of three that have to be entered together are clear: what is shown would leave more than was promised."""
+    parameters = {"z3": (2e-3, 1e-5, "m", "link 3", 0.1), "z4": (1e-3, 1e-5, "m", "link 4", 0.2)}
+    results = _with("geometry", parameters)
+    for together, enter in ((2, ["102.000 mm", "201.000 mm"]), (3, None)):
+        for block in results["effects"][0]["parameters"].values():
+            block["together"] = together
+        table = numbers_table(results, 6)
+        assert table is not None and ("does not repair the model" in table.note) == (enter is None)
+        assert [row[3] for row in table.rows if len(row) > 3] == (enter or [])
+
+
 def test_what_it_removes_has_the_figure_by_block_beside_the_one_at_random() -> None:
     told = _told(one_effect()[0])
     assert told["What it removes"].startswith(

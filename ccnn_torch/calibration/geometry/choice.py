@@ -18,7 +18,7 @@ from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import make_learner
 from ccnn_torch.learners.gp import GPSettings
-from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import joint_deviations
@@ -92,6 +92,7 @@ def choose_model(
     verdict: Verdict | None,
     asked_effects: bool,
     learner_open: bool,
+    learns: bool = True,
 ) -> ModelChoice:
     """Compare what the config leaves open by the held-out pose errors under the candidates' own commands.
 
@@ -105,16 +106,17 @@ def choose_model(
         verdict: effects that were found in the training rows, or that a file names; None without any.
         asked_effects: whether the effects are a part of every candidate.
         learner_open: whether the config leaves the learner to the comparison.
+        learns: whether there is anything that a learner could have.
     """
-    name = mechanism.name
+    name, other = mechanism.name, _ELSE if learns else "constant"
     geometry_why = ""
     if geometry != "none" and not mechanism.geometry:
         geometry_why = f"{name} has no geometric parameters to identify."
-    elif geometry != "none" and isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+    elif geometry != "none" and mechanism.grouped:
         geometry_why = f"{name} has frames per group of rows, and identified geometry has one."
     if geometry_why and geometry == "identify":
         # It is refused where it is fitted, with what to do.
-        return ModelChoice(True, False, _ELSE, "geometry=identify was asked for.")
+        return ModelChoice(True, False, other, "geometry=identify was asked for.")
     if geometry_why:
         geometry = "none"
     identify = {"auto": (True, False), "identify": (True,), "none": (False,)}[geometry]
@@ -122,9 +124,10 @@ def choose_model(
     # Effects that a diagnosis found stand beside identified geometry wherever that may be a part.
     physical = [Candidate(i, e, False) for e in effects for i in (identify if not e else identify[:1]) if i or e]
     asked = "" if geometry == "auto" else geometry_why or f"geometry={geometry} was asked for."
-    nominal_too = False in identify and not asked_effects
-    if not physical or (len(physical) == 1 and not nominal_too and not learner_open):
-        return ModelChoice(identify[0], effects[0], _ELSE, asked)
+    nominal_too = False in identify and not asked_effects and learns
+    if not physical or (len(physical) == 1 and not nominal_too and not (learner_open and learns)):
+        why = "" if learns else "Each row is of two places, so that no learner is trained."
+        return ModelChoice(identify[0], effects[0], other, f"{asked} {why}".strip())
     rows = torch.cat([split.train, split.validation])
     if len(rows) > _MOST_ROWS:
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]
@@ -134,10 +137,10 @@ def choose_model(
     whole = Split(torch.arange(len(rows)), none, none, None if split.groups is None else split.groups[rows])
     try:
         folds = [replace(f, validation=none, test=f.validation) for f in fold_splits(whole, kind, _FOLDS, seed)]
-        errors = _errors(mechanism, few, folds, seed, settings, physical, nominal_too, verdict)
+        errors = _errors(mechanism, few, folds, seed, settings, physical, nominal_too, verdict, learns)
     except (InputError, MethodFailedError) as problem:
         why = f"Candidates could not be cross-validated: {problem}"
-        return ModelChoice(geometry == "identify", effects[0], _ELSE, why)
+        return ModelChoice(geometry == "identify", effects[0], other, why)
     return simplest_of_best(errors, asked)
 
 
@@ -150,12 +153,14 @@ def _errors(
     physical: list[Candidate],
     nominal_too: bool,
     verdict: Verdict | None,
+    learns: bool,
 ) -> dict[Candidate, Tensor]:
     """Mean squared pose error of the held-out rows of each fold, `k` [m²], by candidate, the simplest first.
 
     Args:
         physical: candidates without a learner; one is put on what the best of them leaves.
         nominal_too: whether it may learn everything, on the nominal machine.
+        learns: whether there is a learner at all.
     """
     joints, pose, weight = records.joints, records.pose, settings["rotation_weight"]
     gaps = pose.isnan().any(-1)
@@ -193,11 +198,11 @@ def _errors(
 
     rows = {c: error(c) for c in physical}
     learned = []
-    if physical:
+    if physical and learns:
         best = min(physical, key=lambda c: float((rows[c].nan_to_num(1e6) * held).sum(-1).median()))
         learned.append(best._replace(learner=True))
     # Physics first: what it knows holds beside the measured region as well.
-    learned += [Candidate(False, False, True)] if nominal_too or not physical else []
+    learned += [Candidate(False, False, True)] if learns and (nominal_too or not physical) else []
     rows |= {c: error(c) for c in learned}
     # A gross outlier is no evidence for any of them, and would decide alone.
     length = torch.stack([r.nan_to_num(math.inf) for r in rows.values()]).amin(0).sqrt()

@@ -15,14 +15,14 @@ from ccnn_torch.diagnosis.joint_fit import effects_that_pay, fit_jointly, loose_
 from ccnn_torch.effects import make_effect
 from ccnn_torch.effects.time import FrameDrift
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm
+from ccnn_torch.mechanisms import BlackBox, Mechanism
 from ccnn_torch.records import Records
 
 # Rows that the search uses: more take longer and show the same.
 _MOST_ROWS = 1000
 _EFFECTS = (
-    *("joint_gain", "transmission", "backlash", "friction", "compliance", "gravity", "thermal", "coupling"),
-    "flexure",
+    *("joint_gain", "transmission", "backlash", "friction", "compliance", "sag", "gravity", "thermal"),
+    *("coupling", "flexure"),
 )
 """What is looked for where nothing is asked: all of the library that acts within the machine and that a command can
 know. Frames and geometry are fitted beside, and a drift of the measuring frame where the rows have times; an error of
@@ -45,7 +45,7 @@ def search_effects(
     """
     if isinstance(mechanism, BlackBox):
         return None, ["Effects were not searched: of a simulator every row takes long; see ccnn diagnose."]
-    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+    if mechanism.grouped:
         return None, ["Effects were not searched: one compensator needs one frame, and these rows have several."]
     if len(rows) > _MOST_ROWS:
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]

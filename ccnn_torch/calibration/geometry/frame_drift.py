@@ -33,8 +33,7 @@ def without_frame_drift(
     """
     others, drift = verdict.of_machine()
     # Frames by group of rows are refused beside effects.
-    grouped = any(getattr(mechanism, key, ()) for key in ("frame_per", "tool_per"))
-    if drift is None or grouped:
+    if drift is None or mechanism.grouped:
         return records, verdict, []
     recorded = situation_of(records, mechanism)
     situation = in_time(on_fitted_frames(recorded), moments(records))

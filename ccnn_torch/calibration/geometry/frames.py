@@ -27,7 +27,7 @@ def frames_of_repeats(
     Raises:
         InputError: frames per group of rows where one is needed.
     """
-    if one_for and isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+    if one_for and mechanism.grouped:
         raise InputError(
             f"{one_for}: {mechanism.name} has frames per group of rows (frame_per, tool_per), and one compensator "
             f"needs one frame; take the rows of one group, or write {one_for}=none"
@@ -38,7 +38,7 @@ def frames_of_repeats(
     parameters = fit_unknown(mechanism, records.joints, records.pose, weights, records.columns)
     if parameters is None:
         return None, []
-    if not (getattr(mechanism, "frame_per", ()) or getattr(mechanism, "tool_per", ())):
+    if not mechanism.grouped:
         parameters = parameters.unsqueeze(-2)
     notes = []
     if isinstance(mechanism, SerialArm):

@@ -60,9 +60,14 @@ class Physics:
     every: list[list[Acting]]
     rows: Tensor
 
-    def frames(self, repeat: int, moved: Tensor) -> Tensor:
-        """Frame of the pose of all rows at command and what was learned there, `s x n` [SI], as `reached` gives it."""
+    def frames(self, repeat: int, moved: Tensor, *second: Tensor) -> Tensor:
+        """Frame of the pose of all rows at command and what was learned there, `s x n` [SI], as `reached` gives it.
+
+        second: the same of the second place, where rows are of two.
+        """
         here = replace(self.situations[repeat], joints=moved)
+        if second:
+            here = here.moved([moved, *second], here.parameters)
         return reached(here, self.acting[repeat], self.values[repeat, 0])
 
     def poses(self, repeat: int, moved: Tensor) -> Tensor:
@@ -117,7 +122,7 @@ class Physics:
         # Commands are for whole poses, whatever of them was measured; but of a tool that was seen in part the rest is
         # not known.
         same = (len(a.effect.coefficients(there.whole)) == len(a.coefficients) for a in self.acting[repeat])
-        there = there.whole if all(same) else there
+        there = there.visits if all(same) else there
         values = self.values[repeat, 0, : len(there.mechanism.geometry)]
         return machine_parts(there, self.acting[repeat], values, covariates, margin)
 

@@ -215,6 +215,11 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
+    if _twice(mechanism, records) and method_names(config, "constant") != ["constant"]:
+        raise InputError(
+            f"methods: each row of {records.path} is of two places, and what a learner learns has the joints of one; "
+            "leave methods out, and geometry and effects alone are identified and corrected"
+        )
     if isinstance(mechanism, SerialArm) and config.geometry != "none":
         mechanism = mechanism.with_link_frames()
     held = rows_of_test_file(config.split, records.parts)
@@ -226,6 +231,11 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     prepared = _fitted_to(Source(mechanism, records, settings, choice, verdict), splits, seeds)
     notes = [*held_out_notes(config.split, len(splits[0].test), splits[0]), *notes, *prepared.notes]
     return replace(prepared, notes=notes)
+
+
+def _twice(mechanism: Mechanism, records: Records) -> bool:
+    """Whether each row is of two places, so that there is no deviation of joints to learn."""
+    return len(mechanism.places(records.joints, records.pose)) > 1
 
 
 def over_all_rows(prepared: Prepared) -> Prepared:
@@ -256,6 +266,8 @@ def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepare
     if physics is not None:
         learned = physics.values
         deviations = physics.targets(records.joints, records.pose, settings)
+    if _twice(mechanism, records):
+        deviations = replace(deviations, deviation=torch.zeros_like(deviations.deviation))
     guess = completed(mechanism, records.joints, records.pose, frames)
     jacobian = mechanism.jacobian(records.joints, learned, guess=guess)
     return Prepared(
@@ -307,6 +319,7 @@ def _choice(
         verdict,
         asked,
         method_names(config, "") == [""],
+        not _twice(mechanism, records),
     )
     choice = choose_model(mechanism, records, *about)
     return choice, verdict if choice.effects else None, records, notes

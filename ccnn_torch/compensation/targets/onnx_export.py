@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import count
 from typing import Any
 
@@ -17,10 +17,7 @@ import onnx
 import torch
 from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKernel
 from torch import Tensor
-from torch._guards import TracingContext, tracing
-from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx import GraphModule
-from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
@@ -29,6 +26,7 @@ from ccnn_torch.compensation.routines import KEPT, Functions, execute, routines_
 from ccnn_torch.compensation.targets.golden import Vectors, probe_points
 from ccnn_torch.compensation.targets.onnx_graph import Graph, Value
 from ccnn_torch.compensation.targets.onnx_operations import ByTensors
+from ccnn_torch.compensation.targets.recording import recorded
 from ccnn_torch.errors import MethodFailedError
 
 # Rows of an example, or a few more.
@@ -46,13 +44,6 @@ def rows_apart_from(module: torch.nn.Module) -> int:
     lengths = {n for tensor in tensors for n in tensor.shape if n}
     primes = (p for p in count(_LEAST) if all(p % d for d in range(2, math.isqrt(p) + 1)))
     return next(p for p in primes if all(n % p for n in lengths))
-
-
-def traced(function: Callable[..., Any], *example: Tensor) -> GraphModule:
-    """A function of tensors whose first axis is the batch, by running it."""
-    # One model of the memory for all operations: without a context each makes its own.
-    with torch.no_grad(), tracing(TracingContext(FakeTensorMode())):
-        return make_fx(lambda *given: function(*given), tracing_mode="real", pre_dispatch=True)(*example)
 
 
 # In the graph their numbers are there, so that command + deviation is the joints to the last digit.
@@ -119,7 +110,7 @@ def command_graph(
             own = [(examples | steps)[i].clone() for i in inputs]
             with torch.no_grad():
                 given = [*getattr(functions, name)(*own)]
-            known[key] = traced(lambda *v: [*getattr(functions, name)(*v).values()], *own), given
+            known[key] = recorded(lambda *v: [*getattr(functions, name)(*v).values()], own), given
         module, given = known[key]
         return dict(zip(given, lowering.run(module, [*inputs.values()]), strict=True))
 

@@ -157,6 +157,8 @@ class ByTensors(Lowering):
         shape, solid = [*shape], self.graph.full(value)
         if -1 in shape:
             shape[shape.index(-1)] = math.prod(solid.shape) // -math.prod(shape)
+        if shape == [*solid.shape]:
+            return solid
         sizes = self.graph.constant(np.array(batch_of(shape, self.graph.rows), np.int64))
         return self.graph.node("Reshape", [solid.name, sizes], shape, shape)
 

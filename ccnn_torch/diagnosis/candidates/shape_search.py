@@ -19,7 +19,7 @@ from ccnn_torch.diagnosis.candidates.nuisance import (
     search_charge,
 )
 from ccnn_torch.diagnosis.residual.whitening import Whitening
-from ccnn_torch.effects import Effect, Shape, Situation
+from ccnn_torch.effects import Effect, Shape, Situation, signature
 
 # Log odds, less than these being chance, for which values between those of the grid are evaluated.
 _CHANCE = 5.0
@@ -109,13 +109,16 @@ class Scan:
         self.parts = _parts(self.shapes, len(coefficients))
         self.start = default_shape(situation, effect)
         kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
+        # What acts in two places of a row is no product of a derivative and a form.
+        self.there = there if len(there.places) > 1 else None
+        kind = kind if self.there is None else None
         self.lead = white(torch.nan_to_num(kind())) if kind is not None else None
         self.fixed: Tensor | None = None
-        if isinstance(effect, _Factored):
+        if isinstance(effect, _Factored) and self.there is None:
             self.fixed = white(torch.nan_to_num(situation.once(effect.fixed_columns))) * self.size
         # Which joint a column moves is a matter of the effect's form: the middle and the ends of its grids show it.
         ends = torch.tensor([[s.grid[0], s.grid[-1]] for s in self.shapes], dtype=self.start.dtype).mT
-        first = effect.basis(situation, torch.stack([self.start, *ends]))
+        first = self._basis(torch.stack([self.start, *ends]))
         self.movers = _movers(first) if self.lead is not None else None
         free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
         self.unshaped = self._whitened(first[:1], free, None)[0]
@@ -130,10 +133,16 @@ class Scan:
         if self.fixed is not None and isinstance(self.effect, _Factored):
             factors = _of(self.effect.column_factors(self.situation, candidates), rows, 1)[..., None]
             return [TrialColumns(factors[:, :, p.columns], self._lead(self.fixed, p.columns, rows)) for p in self.parts]
-        basis = _of(self.effect.basis(self.situation, candidates), rows, 1)
+        basis = _of(self._basis(candidates), rows, 1)
         if self.movers is None:
             return [TrialColumns(self._whitened(basis, part.columns, rows)) for part in self.parts]
         return [self._by_movers(basis[..., self.movers[p.columns], p.columns], p.columns, rows) for p in self.parts]
+
+    def _basis(self, shapes: Tensor) -> Tensor:
+        """What each coefficient changes, or in rows of two places the pose by it; shapes `g x h`, `g x s x ... x m`."""
+        if self.there is None:
+            return self.effect.basis(self.situation, shapes)
+        return torch.nan_to_num(signature(self.situation, self.effect, shapes, self.there))
 
     def _by_movers(self, moved: Tensor, columns: list[int], rows: Tensor | None) -> TrialColumns:
         """moved: change of the joint or parameter that each of the columns moves, in the rows, `g x s x m`."""

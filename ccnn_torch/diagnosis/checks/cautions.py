@@ -21,6 +21,7 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.findings import size_words
 from ccnn_torch.diagnosis.verdict.judgement import Judgement, implausible_size
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
+from ccnn_torch.diagnosis.verdict.remainder import times_the_noise
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
 from ccnn_torch.effects.time import ROW
@@ -34,7 +35,7 @@ _DOUBTED, _HOLLOW = 0.9, 0.5
 # Size of the machine, of which no calibration is so far off.
 _LARGE = 0.1
 # Standard deviation left, of that which was given; heavy tails left 0.7 of it in sealed machines.
-_QUIET, _LOUD = 0.5, 2.0
+_QUIET = 0.5
 _MANY = 0.1
 # So many rows set aside are evaluated together, against as many resampled so often; the share of these as close.
 _SEVERAL, _DRAWS, _BY_CHANCE = 5, 1000, 0.003
@@ -110,7 +111,7 @@ def row_cautions(analysis: Analysis, rows: PlausibleRows, names: Sequence[str] =
 
 def _of_place(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Rows set aside that lie together: bad ones lie anywhere."""
-    aside = (analysis.whitening.weight <= 0) & ~analysis.near_singular
+    aside = ~analysis.whitening.counted & ~analysis.near_singular
     count = int(aside.sum())
     if count < _SEVERAL or judgement.drivers:
         return []
@@ -170,20 +171,18 @@ def _of_model(analysis: Analysis, rows: PlausibleRows) -> list[Caution]:
 
 def _of_noise(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Whether what was given is far from what the verdict's effects, or even the richest explanation, leave."""
-    if analysis.whitening.known == 0:
+    if not analysis.noise_is_known:
         return []
-    numbers = analysis.dictionary.grams.values
-    left, least = (
-        (f.rss / max(numbers - f.effective, 1.0)) ** 0.5
-        for f in (judgement.found, min(analysis.found, key=lambda f: f.rss))
-    )
-    if left < _QUIET:
+    found, known = judgement.found, "that was given" if analysis.whitening.known else "that the records show"
+    left = (found.rss / max(analysis.dictionary.grams.values - found.effective, 1.0)) ** 0.5
+    if left < _QUIET and analysis.whitening.known:
         quiet = f"the rows scatter by {number_text(left, 2)} times the noise that was given"
         return [Caution(f"{quiet}: with less of it smaller causes would show")]
-    if least > _LOUD:
-        loud = f"whatever is tried leaves {number_text(least, 2)} times the noise that was given"
-        return [Caution(f"{loud}: it is too small, or something is there that follows nothing recorded")]
-    return []
+    times = times_the_noise(analysis, min(analysis.found, key=lambda f: f.rss))
+    if times <= 1:
+        return []
+    loud = f"whatever is tried leaves {number_text(times, 2)} times the noise {known}"
+    return [Caution(f"{loud}: it is too small, or something is there that follows nothing recorded")]
 
 
 def _of_nothing_gained(analysis: Analysis, judgement: Judgement, together: Gap) -> list[Caution]:
@@ -266,7 +265,7 @@ def _of_periods(analysis: Analysis, judgement: Judgement) -> list[Caution]:
         if seen and max(seen.values()) < _PERIODS:
             joints = " and ".join(n.removeprefix("q") for n in seen)
             words = f"of the periodic error of joint {joints} these rows show {max(seen.values()):.1f} periods"
-            return [Caution(f"{words}: another error of one place may look the same")]
+            return [Caution(f"{words}: another error of one place may look the same", BESIDE_UNKNOWN)]
     return []
 
 
@@ -348,7 +347,10 @@ def joint_scatter(analysis: Analysis, judgement: Judgement) -> Scatter | None:
 # Log odds that an effect must gain by a correction, over all that was found without it: mistakes are rare.
 _GAIN = 10.0
 # Effects that need columns, by how these begin.
-_USED_BY = {"load_": ("compliance", "friction"), "direction": ("backlash", "friction"), "temperature": ("thermal",)}
+_USED_BY = {
+    **{"load_": ("compliance", "friction"), "torque_": ("sag",), "direction": ("backlash", "friction")},
+    "temperature": ("thermal",),
+}
 
 
 def column_mistake(analysis: Analysis) -> str:
@@ -396,7 +398,7 @@ def _evidence(analysis: Analysis, situation: Situation, atom: Atom) -> float:
     white, keep = analysis.whitening, analysis.whitening.keep()
     columns = torch.nan_to_num(signature_at(situation, situation, atom.effect, atom.shape))
     columns = columns if atom.used is None else columns[..., list(atom.used)]
-    fitted = frame_columns(situation, white.weight > 0)
+    fitted = frame_columns(situation, white.counted)
     every = [white(v)[keep] for v in (fitted, analysis.residual[..., None], columns)]
     frames, target, own = (analysis.correlation(v) for v in every)
     y, x = without_fitted(frames, [target, own])

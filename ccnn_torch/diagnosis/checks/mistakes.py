@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis.checks.zeros import wrong_zeros
 from ccnn_torch.diagnosis.residual.distance import USUAL, Size, distance, size_of
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation, pose_residual
@@ -42,6 +43,7 @@ def what_is_wrong(situation: Situation, measured: Tensor, size: Size) -> str:
         or mistake(situation, measured, size, anew=True)
         or tool_remedy(situation, measured, size)
         or frame_remedy(situation, measured, size)
+        or zero_remedy(situation, measured, size)
     )
 
 
@@ -192,9 +194,9 @@ def _swapped(values: Tensor, i: int, k: int) -> Tensor:
 def placed(situation: Situation, measured: Tensor) -> Situation:
     """The rows with unknown frames fitted to these poses; as they are where no frame is unknown, or one per group."""
     mechanism, parameters = situation.mechanism, None
-    if isinstance(mechanism, Framed) and mechanism.unknown_frames:
+    if isinstance(mechanism, Framed) and mechanism.unknown_frames and not mechanism.grouped:
         parameters = mechanism.inlying_frames(situation.joints, measured)
-    elif isinstance(mechanism, SerialArm) and mechanism.unknown_frames and not _grouped(mechanism):
+    elif isinstance(mechanism, SerialArm) and mechanism.unknown_frames and not mechanism.grouped:
         parameters = _closed_form(mechanism, situation.joints, measured)
     return situation if parameters is None else replace(situation, parameters=parameters)
 
@@ -235,7 +237,7 @@ def frame_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
 def tool_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
     """What to write where the measured point is elsewhere on the flange of an arm than its file says; else empty."""
     arm, finite = situation.mechanism, torch.isfinite(measured).all(-1)
-    if not isinstance(arm, SerialArm) or "tool" in arm.unknown_frames or _grouped(arm):
+    if not isinstance(arm, SerialArm) or "tool" in arm.unknown_frames or arm.grouped:
         return ""
     joints, measured = situation.joints[finite], measured[finite]
     if len(joints) < _FEWEST_LATE:
@@ -256,8 +258,16 @@ def tool_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
     )
 
 
-def _grouped(arm: SerialArm) -> bool:
-    return bool(arm.frame_per or arm.tool_per)
+def zero_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
+    """Zeros of an arm's joints with which rows and model agree, frames fitted anew; empty where there are none."""
+    arm, finite = situation.mechanism, torch.isfinite(measured).all(-1)
+    if not isinstance(arm, SerialArm) or len(arm.unknown_frames) < 2 or arm.grouped:
+        return ""
+    if arm.orientation == "direction" or int(finite.sum()) < _FEWEST_LATE:
+        return ""
+    joints, measured = situation.joints[finite], measured[finite]
+    before = arm.pose_error(arm.forward_kinematics(joints, _closed_form(arm, joints, measured)), measured).position
+    return wrong_zeros(arm, joints, measured, min(_MENDED * float(before.median()), _LEFT * USUAL * float(size.place)))
 
 
 def _closed_form(arm: SerialArm, joints: Tensor, measured: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from ccnn_torch.effects.covariates import covariate_units, draw_covariates
 from ccnn_torch.effects.time import ROW, FrameDrift
 from ccnn_torch.errors import InputError
 from ccnn_torch.evidence.dictionary import gain_beside
+from ccnn_torch.records.commanded import SECOND
 
 # Speeds are not among them: rows at rest, as most are, have none.
 _KINDS = ("time", "temperature", "load", "direction")
@@ -167,16 +168,22 @@ def order_shows(analysis: Analysis, judgement: Judgement, columns: Mapping[str, 
 
 
 def _directions(situation: Situation, order: Tensor) -> dict[str, Tensor]:
-    """Sign of each joint's way from the row before in an order of the rows.
+    """Sign of each joint's way from the row before in an order of the rows, to the second place from the first.
 
     A joint that stands still keeps its sign; before its first motion it is 0.
     """
-    way = situation.joints[order].diff(dim=0, prepend=situation.joints[order[:1]]).sign()
+    joints = torch.stack([place.joints for place in situation.places], 1)
+    visited = joints[order].flatten(0, 1)
+    way = visited.diff(dim=0, prepend=visited[:1]).sign()
     rows = torch.arange(len(way))[:, None].expand_as(way)
     last = torch.where(way != 0, rows, 0).cummax(0).values
-    signs = torch.empty_like(situation.joints)
-    signs[order] = way.gather(0, last)
-    return {f"direction{i + 1}": way for i, way in enumerate(signs.unbind(-1))}
+    signs = torch.empty_like(joints)
+    signs[order] = way.gather(0, last).reshape(joints.shape)
+    return {
+        f"direction{i + 1}{ending}": way
+        for ending, place in zip(("", SECOND), signs.unbind(1), strict=False)
+        for i, way in enumerate(place.unbind(-1))
+    }
 
 
 def _numbers(situation: Situation, order: Tensor) -> dict[str, Tensor]:

@@ -100,8 +100,7 @@ def local_discrepancies(
     drivers = [f"joint {joint.name}" for joint in situation.mechanism.joints]
     tracks = unit_range(situation.joints).mT[..., None]
     found = _bump_terms(ground, drivers, tracks, _places(middles, _RADII_ALONG), moved.movedim(-1, 0)[..., None])
-    lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
-    place = unit_range(situation.place[:, lengths] if lengths else situation.place)
+    place = unit_range(situation.place[:, situation.lengths] if situation.lengths else situation.place)
     places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
     # What pulls the platform acts through the joints; what bends a measurement does not.
     platform = platform_moves(situation)

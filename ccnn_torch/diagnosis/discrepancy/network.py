@@ -105,6 +105,8 @@ def remaining_gain(
         "reason": "",
     }
     chance = float(before.std()) / math.sqrt(len(before))
+    if len(analysis.situation.places) > 1:
+        return block | {"reason": "each row is of two places, and a network has the joints of one"}
     # Noise that was estimated is what a fit left: only noise that was given says that nothing is left.
     if white.known > 0 and float(before.mean()) < noise + _CHANCE * chance:
         return block | {"reason": "what the effects leave is no more than the noise"}
@@ -130,7 +132,7 @@ def _left(analysis: Analysis, judgement: Judgement, fold: Tensor, count: int) ->
     chosen = [dictionary.groups[i] for i in judgement.found.members if not dictionary.atoms[i].is_discrepancy]
     x, y = dictionary.columns, dictionary.y
     plain_x, plain_y = analysis.plain
-    weight = white.weight[keep].sqrt()[:, None]
+    weight = white.weight[keep].sqrt()
     used = torch.cat([torch.arange(0), *chosen])
     left = []
     for k in range(count):
@@ -163,7 +165,7 @@ def _predicted(
     turning = torch.tensor([j.unit == "rad" for j in situation.mechanism.joints])
     far = turning & (joints.amax(0) - joints.amin(0) > torch.pi / 2)
     periodic = torch.cat([far, torch.zeros(len(conditions), dtype=torch.bool)])
-    weights = torch.where(fold[rows] == torch.arange(count)[:, None], 0.0, white.weight[here])
+    weights = torch.where(fold[rows] == torch.arange(count)[:, None], 0.0, white.weight[here].mean(-1))
     scaling = Scaling.fit(inputs, deviation, weights, periodic, angles=True)
     data = TrainingData(
         scaling.features(inputs),

@@ -17,6 +17,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import Atom, discrepancy
 from ccnn_torch.effects import Situation
 from ccnn_torch.evidence.priors import OUTSIDE
+from ccnn_torch.records.commanded import SECOND
 
 # Log odds of one that holds most of what a library effect does beside those of the others.
 _NEAR_LIBRARY = math.log(1e-2)
@@ -24,6 +25,8 @@ _NEAR_LIBRARY = math.log(1e-2)
 _TWIN = 2 * OUTSIDE
 # A joint may be off by this much for unforeseen reasons [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
+PLACE = "workspace"
+"""The driver of what follows the pose."""
 ANY = "*"
 """Stands in a driver's name for all of its kind; a verdict names the one that explains most alone."""
 SPEED = "speed"
@@ -47,23 +50,22 @@ _LAGS = (0.05, 0.2)
 _WIDTH = 1.5
 
 
-def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
-    """One or two atoms for each driver that the records hold; beside: names of the library effects that are candidates.
+def smooth_discrepancies(situation: Situation, beside: Sequence[str], rows: int) -> list[Atom]:
+    """One or two atoms for each driver that the records hold; beside: names of the library effects that are candidates;
+    rows: how many were measured, for which there may be several places here.
 
     Drives of one kind have errors of one kind, each along its own track. A transmission's are of a form that holds
     elsewhere, too, so where that is a candidate no discrepancy term of all drives at once takes them from it.
     """
-    mechanism, rows = situation.mechanism, situation.joints.shape[-2]
+    mechanism = situation.mechanism
     place = unit_range(situation.place)
     one = torch.ones_like(place[:, :1])
     few = max(_FEWEST, min(_FEW, rows // _ROWS_A_BUMP))
     around = torch.cat([one, place, _bumps(place, min(_PLACES, max(_FEWEST_PLACES, rows // _ROWS_A_PLACE)))], -1)
     most = min(_MOST_PLACES, max(_MOST, rows // _ROWS_A_COLUMN))
-    found = [_atom(situation, "workspace", around, most=most)]
+    found = [_atom(situation, PLACE, around, most=most)]
     found.append(
-        _atom(
-            situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most, log_odds=_NEAR_LIBRARY
-        )
+        _atom(situation, PLACE, torch.cat([one, *_configuration(situation)], -1), most=most, log_odds=_NEAR_LIBRARY)
     )
     own: list[Tensor] = []
     for i, joint in enumerate(mechanism.joints):
@@ -113,7 +115,9 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
 
 
 def driver_of(name: str) -> str | None:
-    """What a covariate is called as a driver; None for one that is none."""
+    """What a covariate is called as a driver; None for one that is none, or that is another's in the second place."""
+    if name.endswith(SECOND):
+        return None
     if name.startswith("load_"):
         return f"load {name.removeprefix('load_')}"
     if name.startswith("direction"):
@@ -304,8 +308,7 @@ def _driven(situation: Situation, driver: str, features: Tensor) -> Atom:
 
 def _carried(situation: Situation, axes: Tensor) -> Atom:
     """Shifts along axes, `s x 3 x 3`, by a plane over the workspace, and turns about them."""
-    lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
-    place = unit_range(situation.place[:, lengths])
+    place = unit_range(situation.place[:, situation.lengths])
     features = torch.cat([torch.ones_like(place[:, :1]), place], -1)
     moves = platform_moves(situation)
     shifts = ((moves[..., :3] @ axes)[..., None] * features[:, None, None]).flatten(-2)

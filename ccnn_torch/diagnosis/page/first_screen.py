@@ -54,6 +54,8 @@ def first_screen(results: Block, about: About, most: int = ON_PAGE) -> list[Answ
         said.append(Answer("What it removes", removed))
     if look := " ".join(f.look for f in findings(results)):
         said.append(Answer("Look at", look, table=numbers_table(results, most)))
+    if results.get("frames"):
+        said.append(Answer("Fitted frames", _frames(results["frames"])))
     if about.compensate:
         said.append(Answer("Compensate", about.compensate[0], tuple(about.compensate[1:])))
     if measure := _measure(results, about):
@@ -105,6 +107,16 @@ def _removed(results: Block) -> str:
     if network.get("gap_after") is not None and network["gain_ci95"][0] > 0:
         floor += f"; with a network on the rest {size_text(network['gap_after'], network)}"
     return f"{text}{floor}."
+
+
+def _frames(frames: Mapping[str, Any]) -> str:
+    """What was fitted before anything was named, and what it may hide."""
+    told = []
+    for name, (x, y, z, *turn) in frames.items():
+        shift = ", ".join(f"{1e3 * v:.2f}" for v in (x, y, z))
+        told.append(f"{name} ({shift}) mm and {math.degrees(math.hypot(*turn)):.3f}° from the model's")
+    hidden = " or ".join({"base": "the first link's place", "tool": "the flange"}[name] for name in frames)
+    return f"{capital('; '.join(told))}. An error of {hidden} is in these, and in no number above."
 
 
 def _measure(results: Block, about: About) -> str:
@@ -249,15 +261,18 @@ def numbers_table(results: Block, most: int) -> Table | None:
     """
     rows, notes, left_out = [], [], 0
     by_name, chosen = {e["name"]: e for e in results["effects"]}, results["verdict"]["effects"]
-    each = max(most // max(len(chosen), 1), _FEWEST)
     for effect in chosen:
         parameters = by_name.get(effect, {}).get("parameters", {})
         clear = clear_parameters(parameters)
+        needed = max((block.get("together", 1) for block in clear.values()), default=0)
+        repairs = needed <= min(ON_PAGE, len(clear))
+        each = max(most // max(len(chosen), 1), _FEWEST, needed if repairs else 0)
+        notes += [] if repairs else ["What is shown does not repair the model: enter all numbers together."]
         for name in list(clear)[:each]:
             block = parameters[name]
             value, error = block["value"], _Z95 * block["sd"]
             part = block.get("part") or ""
-            enter = "–" if block.get("nominal") is None else _whole(block, block["nominal"] + value)
+            enter = "–" if block.get("nominal") is None or not repairs else _whole(block, block["nominal"] + value)
             text = f"{block.get('word') or _named(name, part)}{_often(name, parameters)}{_counted(block)}"
             text = text if len(chosen) == 1 else f"{words_of(effect).short}, {text}"
             rows.append((text, told_words(block, value, 4), f"± {told_words(block, error, 2, value)}", enter))

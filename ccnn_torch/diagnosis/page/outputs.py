@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.checks.identifiable import Check
+from ccnn_torch.diagnosis.mount import machine_as_told
 from ccnn_torch.diagnosis.page.data import CORRECTED, NEXT, RESULT, about_of
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
 from ccnn_torch.diagnosis.page.tables import write_next_csv
@@ -23,7 +24,7 @@ from ccnn_torch.diagnosis.verdict.text import noise_text
 from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import SerialArm, fit_unknown
+from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
@@ -79,20 +80,15 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
 
 def write_corrected(folder: Path, diagnosis: Diagnosis) -> None:
     """The machine with the geometry that was named, all of its numbers in it and its frames fitted again."""
-    analysis, mechanism = diagnosis.analysis, diagnosis.analysis.situation.mechanism
+    mechanism, frames = diagnosis.analysis.situation.mechanism, diagnosis.analysis.situation.parameters
     named = [e["parameters"] for e in diagnosis.effects if e["name"] in diagnosis.verdict["effects"]]
-    found = {n: b["value"] for parameters in named for n, b in parameters.items() if b.get("nominal") is not None}
-    frames = analysis.situation.parameters
+    changed = any(b.get("nominal") is not None for parameters in named for b in parameters.values())
     # Frames by group of rows are no machine's.
-    if not found or (frames is not None and frames.dim() > 1):
+    machine = machine_as_told(diagnosis) if changed else None
+    if machine is None:
         return
     before = mechanism.nominal if frames is None else frames
     names = [p.name for p in mechanism.geometry]
-    change = torch.tensor([found.get(name, 0.0) for name in names], dtype=torch.float64)
-    machine = mechanism.with_nominal(mechanism.nominal + change)
-    rows = analysis.situation.joints, analysis.measured
-    fitted = fit_unknown(machine, *rows)
-    machine = machine if fitted is None else machine.with_nominal(fitted)
     nominal = dict(zip(names, before.tolist(), strict=True))
     maps = [(diagnosis.machine or {}).get(key) for key in ("columns", "joint_map")]
     write_machine(machine, nominal, folder, Path(CORRECTED[0]).stem, *maps)

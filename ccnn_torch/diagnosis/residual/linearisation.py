@@ -3,27 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import scales
-from ccnn_torch.effects import Acting, Effect, Situation, filled, measured_channels, reached
+from ccnn_torch.effects import Acting, Effect, Situation, filled, measured_channels, moved, reached, signature
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
-
-
-def moved(situation: Situation, acting: Sequence[Acting]) -> Situation:
-    """The same rows with joints and parameters as the effects make them."""
-    mechanism = situation.mechanism
-    joints = situation.joints
-    parameters = mechanism.resolve(situation.parameters).expand(*joints.shape[:-1], -1)
-    for one in acting:
-        if one.effect.kind == "joints":
-            joints = joints + one.change(situation)
-        elif one.effect.kind == "parameters":
-            parameters = parameters + one.change(situation)
-    return replace(situation, joints=joints, parameters=parameters, guess=situation.pose)
 
 
 def remainder(
@@ -44,12 +30,7 @@ def remainder(
 
 def signature_at(situation: Situation, there: Situation, effect: Effect, shape: Tensor) -> Tensor:
     """Change of the pose per plausible size of each coefficient about the machine `there`, `s x c x m`."""
-    basis = effect.basis(situation, shape) * scales(effect.coefficients(situation), situation.joints)
-    if effect.kind == "joints":
-        return there.jacobian @ basis
-    if effect.kind == "parameters":
-        return there.parameter_jacobian @ basis
-    return basis
+    return signature(situation, effect, shape, there) * scales(effect.coefficients(situation), situation.joints)
 
 
 def tangent(situation: Situation, left: Tensor, acting: Sequence[Acting]) -> tuple[Situation, Tensor]:

@@ -66,7 +66,8 @@ def fitted_whitening(
         usable, seen = usable & seen.all(-1), None
     seen = None if seen is None else seen[:, channels]
     given, known = (residual.new_ones(residual.shape[-1]), 0.0) if noise is None else (noise, _KNOWN)
-    white = Whitening(channels, given[channels], usable.to(residual.dtype), known, seen, axes)
+    weight = usable.to(residual.dtype)[:, None].expand(-1, len(channels))
+    white = Whitening(channels, given[channels], weight, known, seen, axes)
     y = white.picked(residual)
     shown = [white.picked(c).to(residual.dtype) for c in columns if c.shape[-1]]
     shown = shown if seen is None else [c * seen[..., None] for c in shown]
@@ -85,7 +86,7 @@ def fitted_whitening(
             grams, groups = grams_of(white.scaled(own), white.scaled(y)), groups_of(shown[k] for k in chosen)
             fit = fit_sets(grams, [groups], 0.0, _UPDATES, _ANY_SIZE, (log_scale, y.new_ones(1)))
             left, log_scale = y - own @ fit.mean[0], fit.log_scale
-            free = 1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0)
+            free = 1 - float(fit.effective[0]) / max(float(white.counted.sum()) * len(channels), 1.0)
             white = renewed(white, left, y, free, usable)
         rest = [k for k in range(len(shown)) if k not in chosen]
         if not rest:
@@ -120,7 +121,7 @@ class _Everything:
         self._turned: tuple[Axes, Tensor] | None = None
         self._among = [self._by_channel(c, c) for c in columns]
         # Weights are 1 or 0 at first.
-        count = white.weight.sum() * len(white.channels)
+        count = white.weight.sum()
         per = white.sigma[:, None] ** -2
         squares = [(g.diagonal(dim1=-2, dim2=-1) * per).sum() / g.shape[-1] for g in self._among]
         self.size = [(s / count).sqrt().clamp_min(1e-300) for s in squares]
@@ -128,7 +129,7 @@ class _Everything:
     def _by_channel(self, one: Tensor, other: Tensor) -> Tensor:
         """Inner products `c x m x k` of `s x c x m` and `s x c x k`."""
         plain = bool((self._weight == 1).all())
-        weighted = one if plain else one * self._weight[:, None, None]
+        weighted = one if plain else one * self._weight[..., None]
         return weighted.permute(1, 2, 0) @ other.transpose(0, 1)
 
     def by_channel(self, y: Tensor, white: Whitening) -> list[list[GroupProducts]]:
@@ -145,13 +146,13 @@ class _Everything:
         """Log evidence that each candidate would gain beside a fit that leaves so much, `s x c`, as if all rows weighed
         alike and up to a number that all have in common: near enough to rank them."""
         per = white.sigma**-2
-        share = per * white.weight.sum() / self._weight.sum()
+        share = per * white.weight.sum(0) / self._weight.sum(0)
         if self._turned is None or _spread(share / self._turned[1]) > _SAME_AXES:
             square = share[:, None, None]
             inner = [(a * square).sum(0) / size**2 for a, size in zip(self._among, self.size, strict=True)]
             self._turned = axes_of(inner, left), share
         axes, before = self._turned
-        target = (left * white.weight[:, None] * per).reshape(-1)
+        target = (left * white.weight * per).reshape(-1)
         along = axes.turned(
             [c.flatten(0, 1).mT @ target / size for c, size in zip(self.columns, self.size, strict=True)]
         )

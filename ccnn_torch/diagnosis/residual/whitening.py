@@ -9,13 +9,13 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis.residual.tails import weights_of
 from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import sees_directions
 
 _NAMES = ("x", "y", "z", "rx", "ry", "rz")
-# Degrees of freedom of the row weights (Student t), and beyond how many times its noise a row is set aside.
-_DEGREES = 4.0
-_GROSS = 6.0
+# Beyond how many times its noise a row is set aside, and the quantile of the rows that are never.
+_GROSS, _KEPT = 6.0, 0.8
 NO_NOISE = 1e-10
 """Smallest noise [m], [rad]: below that of any device, above the rounding of the solvers."""
 MAD = 1.4826
@@ -24,8 +24,6 @@ LEAST_FREE = 0.1
 """Share of the values that a fit leaves free, at least: no noise is estimated from fewer."""
 # Estimated noise, at least, as a share of the residual.
 _LEAST_NOISE = 1e-4
-# Quantile of the rows that are never set aside; ratio of the fourth moment to a normal one from which tails are heavy.
-_KEPT, _HEAVY = 0.8, 1.5
 ROUNDING = 1e-9
 """Directions of what was fitted before with less than this share of the largest one are rounding."""
 
@@ -37,7 +35,7 @@ class Whitening:
     Attributes:
         channels: which of the pose channels, `c`.
         sigma: standard deviation of each [m, rad], `c`.
-        weight: of each row, `s`; 0 = set aside.
+        weight: of each value, `s x c`; 0 in a row that is set aside.
         known: weight of the prior knowledge of the noise, in values; 0 = estimated from these rows.
         seen: which values were measured, `s x c` bool; None = all.
         axes: of the measuring device, in which the channels are, `s x c x c0`; None = those of the base frame.
@@ -81,7 +79,7 @@ class Whitening:
     @cached_property
     def scale(self) -> Tensor:
         """What a value of the channels is multiplied by, `s x c` [1/m], [1/rad]."""
-        scale = self.weight.sqrt()[:, None] / self.sigma
+        scale = self.weight.sqrt() / self.sigma
         return scale if self.seen is None else torch.where(self.seen, scale, 0.0)
 
     def usual(self, values: Tensor, rows: Tensor) -> Tensor:
@@ -102,9 +100,14 @@ class Whitening:
         there = self.keep() if rows is None else rows
         return float(len(there) * len(self.channels) if self.seen is None else self.seen[there].sum())
 
+    @property
+    def counted(self) -> Tensor:
+        """Whether a row counts, `s` bool."""
+        return (self.weight > 0).any(-1)
+
     def keep(self) -> Tensor:
         """Indices of the rows that count."""
-        return torch.nonzero(self.weight > 0).squeeze(-1)
+        return torch.nonzero(self.counted).squeeze(-1)
 
 
 def device_axes(situation: Situation) -> Tensor | None:
@@ -128,18 +131,17 @@ def moving_channels(situation: Situation) -> Tensor:
     if sees_directions(situation.mechanism):
         return torch.arange(2)
     slope = torch.nan_to_num(situation.frame_slope).square().mean((0, 2))
-    units = [c.unit for c in situation.mechanism.pose]
+    units = [c.unit for c in situation.mechanism.pose[: situation.mechanism.compared]]
     kinds = [(slope[:3], units.count("m"), 0), (slope[3:], units.count("rad"), 3)]
     chosen = [kind.argsort(descending=True, stable=True)[:count] + first for kind, count, first in kinds]
     return torch.cat(chosen).sort().values
 
 
 def reweighted(white: Whitening, left: Tensor, usable: Tensor, free: float) -> Whitening:
-    """Weights of rows from what a fit leaves, `s x c`.
+    """Weights of values from what a fit leaves, `s x c`.
 
-    Rows beyond six times the usual are set aside, no more than a fifth of them. The others count by Student's t only
-    where the remainder has heavier tails than a normal one: with normal noise every weight would be thrown away for
-    nothing.
+    Rows beyond six times the usual are set aside, no more than a fifth of them. The others count by Student's t, of
+    whole rows or of each value by itself, where that is clearly more probable than a normal distribution.
     """
     c = len(white.channels)
     size = (left / white.sigma).square().sum(-1) / max(free, LEAST_FREE)
@@ -152,10 +154,11 @@ def reweighted(white: Whitening, left: Tensor, usable: Tensor, free: float) -> W
     gross = size > (_GROSS**2) * max(1.0, c / 2)
     limit = torch.quantile(size[usable], _KEPT)
     aside = (gross & (size > limit)) | ~usable
-    inside = size[~aside]
-    heavy = float(inside.square().mean()) > (c * c + 2 * c) * _HEAVY
-    weight = (_DEGREES + c) / (_DEGREES + size) if heavy else torch.ones_like(size)
-    weight = torch.where(aside, torch.zeros_like(weight), weight)
+    inside = ~aside
+    there = torch.ones_like(left, dtype=torch.bool) if white.seen is None else white.seen
+    weight = torch.zeros_like(left)
+    apart = left[inside] / white.sigma / max(free, LEAST_FREE) ** 0.5
+    weight[inside] = weights_of(apart, there[inside], white.known > 0)
     return replace(white, weight=weight)
 
 
@@ -203,7 +206,7 @@ def renewed(white: Whitening, left: Tensor, residual: Tensor, free: float, usabl
         usable: rows that may count, `s`.
     """
     if white.known == 0:
-        counted = (white.weight > 0) & usable
+        counted = white.counted & usable
         spread = white.usual(left, counted) * MAD / max(free, LEAST_FREE) ** 0.5
         rms = white.usual(residual, counted) * MAD
         white = replace(white, sigma=torch.maximum(spread, _LEAST_NOISE * rms).clamp_min(NO_NOISE))

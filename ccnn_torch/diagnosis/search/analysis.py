@@ -217,7 +217,7 @@ def _about_nominal(situation: Situation, measured: Tensor, effects: Sequence[Eff
     residual, fitted = only_usable(residual, usable), frame_columns(situation, usable)
     atoms = [without_unused_rows(default_atom(situation, situation, e), usable) for e in effects]
     names = [e.name for e in effects]
-    rest = [*smooth_discrepancies(situation, names), *linear_discrepancies(situation, names)]
+    rest = _discrepancies(situation, names)
     known = [a for a in rest if bool((torch.isfinite(a.columns.sum((1, 2))) | ~usable).all())]
     rest = [without_unused_rows(a, usable) for a in known if bool(a.columns[usable].any())]
     # What does not show at all in these rows is no candidate (latency at rest).
@@ -289,6 +289,23 @@ def _about_best_set(state: Analysis) -> Analysis | None:
         again = local_discrepancies(situation, jacobian, target, white, beside)
         every += [without_unused_rows(a, ok) for a in again]
     return _searched(rows, target, fitted, white, every, names)
+
+
+def _discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
+    """Terms for each driver; of rows of two places what the driver does at both."""
+    places, rows = situation.places, len(situation.joints)
+    if len(places) > 1:
+        situation = replace(
+            situation,
+            joints=torch.cat([place.joints for place in places]),
+            guess=torch.cat([place.pose for place in places]),
+            covariates={n: torch.cat([place.covariates[n] for place in places]) for n in situation.covariates},
+        )
+    found = [*smooth_discrepancies(situation, beside, rows), *linear_discrepancies(situation, beside)]
+    return [
+        replace(a, columns=a.columns.reshape(len(places), rows, *a.columns.shape[1:]).sum(0)) if len(places) > 1 else a
+        for a in found
+    ]
 
 
 def _with_shared_noise(state: Analysis) -> Analysis:

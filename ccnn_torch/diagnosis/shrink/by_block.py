@@ -34,7 +34,7 @@ def by_block(made: Blocks) -> dict[str, Any] | None:
     atoms = analysis.atoms
     members = [i for i in judgement.found.members if atoms[i].name in judgement.names]
     white, keep = analysis.whitening, analysis.whitening.keep()
-    framed, fresh = white(analysis.fitted)[keep], white(frame_columns(analysis.situation, white.weight > 0))[keep]
+    framed, fresh = white(analysis.fitted)[keep], white(frame_columns(analysis.situation, white.counted))[keep]
     number = cut(analysis.situation.joints[keep], fresh)
     if not members or not bool(torch.bincount(number, minlength=FOLDS).all()):
         return None
@@ -55,7 +55,7 @@ def by_block(made: Blocks) -> dict[str, Any] | None:
         here = columns[there] - framed[there] @ alone(x)
         left[there] = target[there] - columns[there] @ mean - framed[there] @ frame
         uncertain[there] = ((here @ fit.covariance[0]) * here).sum(-1)
-    weight = white.weight[keep].sqrt()[:, None]
+    weight = white.weight[keep].sqrt()
     held = HeldOut(left / weight * white.sigma, uncertain / weight.square() * white.sigma.square())
     start = before / weight * white.sigma
     gap = made.main(held, start)

@@ -27,7 +27,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     # What is left of a row is that of the row itself, whatever it shares with others.
     plain_x, plain_y = analysis.plain
     fold = folds(analysis.situation.joints[keep], seed)
-    weight = analysis.whitening.weight[keep].sqrt()[:, None]
+    weight = analysis.whitening.weight[keep].sqrt()
     sigma = analysis.whitening.sigma
     left = [y.clone() for _ in sets]
     uncertain = [torch.zeros_like(y) for _ in sets]

@@ -13,6 +13,7 @@ from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE
 from ccnn_torch.diagnosis.result import effect_block, gap_block
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
+from ccnn_torch.diagnosis.verdict.fewest import fewest, together
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Coefficient
 from ccnn_torch.evidence.dictionary import covariance
@@ -93,7 +94,7 @@ def noise_floor(analysis: Analysis) -> Tensor:
     free = max(1 - best.effective / analysis.dictionary.grams.values, LEAST_FREE)
     # No more than the richest fit leaves.
     share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)
-    noise = (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * share
+    noise = (left / white.weight[keep].sqrt() * white.sigma).square().mean(0) / free * share
     return noise if white.times is None else noise * white.times
 
 
@@ -112,16 +113,23 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
     atom = atoms[own.members[place]]
     assert atom.effect is not None
     start = sum(len(m) for m in own.mean[:place])
-    deviation = (
-        covariance(analysis.dictionary, own).diagonal()[start : start + len(own.mean[place])].clamp_min(0).sqrt()
-    )
+    mean, here = own.mean[place], slice(start, start + len(own.mean[place]))
+    spread = covariance(analysis.dictionary, own)[here, here]
+    deviation = spread.diagonal().clamp_min(0).sqrt()
+    needed: dict[str, int] = {}
+    if atom.effect.kind == "parameters":
+        group = analysis.dictionary.groups[own.members[place]]
+        gram = analysis.dictionary.grams.xx[group][:, group]
+        mean, deviation = fewest(gram, mean, spread, own.noise)
+        needed = {"together": together(gram, mean, deviation, own.rss)}
     coefficients = atom.coefficients(analysis.situation)
     mechanism = analysis.situation.mechanism
     nominal = {p.name: float(v) for p, v in zip(mechanism.geometry, mechanism.nominal, strict=True)}
     found: dict[str, dict[str, Any]] = {
         c.name: {"value": float(v) * c.scale, "sd": float(d) * c.scale, "unit": c.unit, "part": _part(c, name)}
+        | needed
         | ({"nominal": nominal[c.name]} if atom.effect.kind == "parameters" and c.name in nominal else {})
-        for c, v, d in zip(coefficients, own.mean[place], deviation, strict=True)
+        for c, v, d in zip(coefficients, mean, deviation, strict=True)
     }
     senses = {p.name: p.sense for p in mechanism.geometry if p.sense}
     senses |= {f"q{name.removeprefix('theta')}": sense for name, sense in senses.items() if name.startswith("theta")}

@@ -10,9 +10,10 @@ import torch
 
 from ccnn_torch.diagnosis.discrepancy.smooth import ANY, joint_moves
 from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.verdict.remainder import rest_of
 from ccnn_torch.effects import EFFECTS, pose_residual
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, gain_beside
-from ccnn_torch.evidence.form_error import Posterior, is_unexplained, with_form_error
+from ccnn_torch.evidence.form_error import Posterior, with_form_error
 from ccnn_torch.evidence.judge import ODDS, Explanation, Verdict, classes_of, judge, marginal, posterior
 from ccnn_torch.evidence.sets import scored, subsets_with_one_less
 
@@ -79,8 +80,8 @@ def judge_rows(analysis: Analysis) -> Judgement:
         same = (f for f in analysis.found if _named(analysis, f) == (explanation.names, explanation.drivers))
         return max([explanation.best, *same], key=lambda f: f.log_posterior)
 
-    verdict = judge(leading, every, lambda e: not is_unexplained(analysis.dictionary, fitted(e), analysis.floor))
-    verdict = _in_order_of_library(analysis, verdict, leading, every)
+    verdict = judge(leading, every, lambda e: rest_of(analysis, fitted(e)))
+    verdict = in_order_of_library(analysis, verdict, leading, every)
     names, found, drivers = verdict.chosen.names, fitted(verdict.chosen), verdict.drivers
     if verdict.outside:
         drivers = drivers or next((d for f in usual.found if (d := _named(analysis, f)[1])), ())
@@ -126,7 +127,7 @@ def _is_least(analysis: Analysis, members: tuple[int, ...]) -> bool:
     return all(_rank(analysis, fewer) < whole for fewer in subsets_with_one_less(members))
 
 
-def _in_order_of_library(
+def in_order_of_library(
     analysis: Analysis,
     verdict: Verdict[FittedSet],
     explanations: Sequence[Explanation[FittedSet]],
@@ -154,6 +155,8 @@ def _in_order_of_library(
         return verdict
     if not _is_least(analysis, own):
         inside = [e for e in inside if len(e.names) < len(chosen.names)]
+    if not inside:
+        return verdict
     # Where the data ask for implausible sizes, these tell apart what the columns do not.
     least = max(e.best.log_evidence for e in inside) - math.log(ODDS)
     same = [e for e in inside if e.best.log_evidence > least and is_same(e)]

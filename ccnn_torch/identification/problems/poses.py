@@ -22,7 +22,7 @@ from ccnn_torch.identification.problems.whitened import (
     gather_rows,
     whitened_problem,
 )
-from ccnn_torch.mechanisms import Mechanism, Seen, SerialArm, SetUps
+from ccnn_torch.mechanisms import Giving, Mechanism, Seen, SerialArm, SetUps
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
@@ -182,9 +182,14 @@ def forward_problem(
     turns = (rotation_vector_to_matrix(rows.pose[..., turning]).flatten(-2),) if turning else ()
     seen = None if bool(known.all()) else known[..., order].reshape(-1, rows.pose.shape[-2], len(order))
 
+    plain = mechanism
+    while isinstance(plain, SetUps | Giving):
+        plain = plain.machine
+
     def difference(full: Tensor, q: Tensor, x: Tensor, *measured: Tensor) -> Tensor:
         """In the order of `order`."""
-        if isinstance(mechanism, SerialArm | SetUps) and turning:
+        if isinstance(plain, SerialArm) and turning:
+            assert isinstance(mechanism, SerialArm | SetUps | Giving)
             position, rotation = mechanism.forward_frame(q, full)
         else:
             there = mechanism.forward_kinematics(q, full, x)

@@ -12,7 +12,9 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.machines.serial import SerialArm
+from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.pose import Frame
+from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.outliers import FAR, inlying, residual_scale
 from ccnn_torch.numerics.rotations import (
@@ -135,7 +137,9 @@ def _base_by_relaxation(rotation: Tensor, position: Tensor, measured: Tensor, we
     centred = measured - measured.mean(-2, keepdim=True)
     eye = torch.eye(3, dtype=position.dtype)
     matrix = torch.einsum("il,...j->...ilj", eye, centred).flatten(-2)
-    design = torch.cat([matrix, -rotation, -eye.expand_as(rotation)], dim=-1)
+    lead = leading_shape(matrix[..., 0], rotation[..., 0])
+    parts = (matrix, -rotation, -eye)
+    design = torch.cat([part.expand(*lead, 3, part.shape[-1]) for part in parts], dim=-1)
     solved = _weighted_linear(design, position, weights)
     relaxed = solved[..., :9].reshape(*solved.shape[:-1], 3, 3)
     return nearest_rotation(relaxed).mT
@@ -204,7 +208,7 @@ def fit_frames(
     """
     weights = torch.ones(len(joints), dtype=torch.float64) if weights is None else weights
     weights, pose = torch.where(pose.isnan().any(-1), 0.0, weights), pose.nan_to_num()
-    grouped = bool(arm.frame_per or arm.tool_per)
+    grouped = arm.grouped
     lead = weights.shape[:-1]
     if not arm.unknown_frames:
         return arm.nominal.expand(*lead, *([len(joints)] if grouped else []), -1).clone()
@@ -212,7 +216,8 @@ def fit_frames(
     tool_of, tool_names = groups_of(arm, "tool_per", arm.tool_per, columns, len(joints))
     needed = 3 if grouped or arm.orientation == "rotation_vector" else 5
     for group_of, names in ((base_of, base_names), (tool_of, tool_names)):
-        _check_rows(arm, weights, group_of, names, needed)
+        for group, name in enumerate(names):
+            check_rows_of(arm.name, name, weights[..., group_of == group], needed)
     rotation, position = arm.flange(joints)
     measured = arm.frame(pose)
     if arm.orientation == "direction":
@@ -311,7 +316,7 @@ def _pick(values: Tensor, best: Tensor) -> Tensor:
 
 
 def groups_of(
-    arm: SerialArm, key: str, names: Sequence[str], columns: Mapping[str, NDArray[np.float64]] | None, rows: int
+    arm: Mechanism, key: str, names: Sequence[str], columns: Mapping[str, NDArray[np.float64]] | None, rows: int
 ) -> tuple[Tensor, list[str]]:
     """Group number of each row, `s` int64, and what each group is called."""
     if not names:
@@ -327,11 +332,11 @@ def groups_of(
     return torch.from_numpy(number.reshape(-1).astype(np.int64)), said
 
 
-def _check_rows(arm: SerialArm, weights: Tensor, group_of: Tensor, names: list[str], needed: int) -> None:
-    for group, name in enumerate(names):
-        rows = int((weights[..., group_of == group] > 0).sum(-1).min())
-        if rows < needed:
-            raise InputError(f"{arm.name}: {name}: a frame needs at least {needed} training rows, got {rows}")
+def check_rows_of(machine: str, group: str, weights: Tensor, needed: int) -> None:
+    """Refuse a group of rows, of weights `... x s`, that is too small for a frame of its own."""
+    rows = int((weights > 0).sum(-1).min())
+    if rows < needed:
+        raise InputError(f"{machine}: {group}: a frame needs at least {needed} training rows, got {rows}")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -40,18 +41,32 @@ class Framed(Around):
 
     @property
     def unknown_frames(self) -> tuple[str, ...]:
-        """The frames that are to be fitted to rows first: all, as long as they are nominally the identity."""
+        """The frames that are to be fitted to rows first: all, where they are by group or nominally the identity."""
         base, _, tool = self._split(self.nominal)
-        return () if bool(base.any() or tool.any()) else ("base",) * self.base + ("tool",) * self.tool
+        if not self.grouped and bool(base.any() or tool.any()):
+            return ()
+        return ("base",) * self.base + ("tool",) * self.tool
 
     def __init__(
-        self, mechanism: Mechanism, base: bool = True, tool: bool = False, rotation_weight: float = 0.04
+        self,
+        mechanism: Mechanism,
+        base: bool = True,
+        tool: bool = False,
+        rotation_weight: float = 0.04,
+        frame_per: Sequence[str] = (),
+        tool_per: Sequence[str] = (),
     ) -> None:
-        """See the class.
+        """See the class; frame_per, tool_per: as of `Mechanism`.
 
         Raises:
-            InputError: a tool on a mechanism without orientation, where it would be a shift of the base.
+            InputError: a tool on a mechanism without orientation, where it would be a shift of the base, or groups of a
+                frame that there is not.
         """
+        for key, names, free in (("frame_per", frame_per, "base"), ("tool_per", tool_per, "tool")):
+            if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+                raise InputError(f"mechanism 'framed': {key} must be a list of columns, e.g. [station], not {names!r}")
+            if names and not (base if free == "base" else tool):
+                raise InputError(f"mechanism 'framed': {key} needs a {free} frame; write {free}: true, or remove {key}")
         inner = mechanism.with_nominal(mechanism.nominal)
         turns = inner.frame(inner.home_pose)[1] is not None
         if tool and not turns:
@@ -76,13 +91,15 @@ class Framed(Around):
         self.mechanism = inner
         self.takes = inner.takes
         self.base, self.tool, self.rotation_weight = base, tool, rotation_weight
+        self.frame_per, self.tool_per = tuple(frame_per), tuple(tool_per)
         # Where the coordinates of the mechanism's pose are those of its frame there is nothing to search.
         plain = type(inner).frame is Mechanism.frame and type(inner).pose_near is Mechanism.pose_near
         self._plain = plain and (not turns or len(inner.pose) == 6)
         self._follow_nominal()
 
     def _own_file(self) -> dict[str, Any]:
-        keys = {"base": self.base, "tool": self.tool, "rotation_weight": self.rotation_weight}
+        keys: dict[str, Any] = {"base": self.base, "tool": self.tool, "rotation_weight": self.rotation_weight}
+        keys |= {key: list(names) for key in ("frame_per", "tool_per") if (names := getattr(self, key))}
         return {"spec": "framed", "keys": {"mechanism": self.mechanism.describe(), **keys}}
 
     def _follow_nominal(self) -> None:
@@ -90,7 +107,7 @@ class Framed(Around):
         self.mechanism.nominal.copy_(self._split(self.nominal)[1])
         self.mechanism._follow_nominal()
         self.home_joints.copy_(self.mechanism.home_joints)
-        self.home_pose.copy_(self._seen(self.mechanism.home_pose, self.nominal))
+        self.home_pose.copy_(self.seen(self.mechanism.home_pose, self.nominal))
         samples = self.sample_workspace(256, torch.Generator().manual_seed(0))
         # Coordinates that the mechanism does not move still need a box that is not empty.
         self.low.copy_(samples.amin(0) - 1e-6)
@@ -102,15 +119,15 @@ class Framed(Around):
 
     def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
         """Samples of the mechanism, as the measuring device sees them; `count x p` [SI]."""
-        return self._seen(self.mechanism.sample_workspace(count, generator), self.nominal)
+        return self.seen(self.mechanism.sample_workspace(count, generator), self.nominal)
 
     def forward_kinematics(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
         """The mechanism's pose of the joints, seen through both frames."""
         values = self.resolve(parameters)
-        near = None if guess is None else self.mechanism.pose_near(*self._unseen(guess, values)).detach()
-        return self._seen(self.mechanism.forward_kinematics(joints, self._split(values)[1], near), values)
+        near = None if guess is None else self.mechanism.pose_near(*self.unseen(guess, values)).detach()
+        return self.seen(self.mechanism.forward_kinematics(joints, self._split(values)[1], near), values)
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x p`."""
@@ -136,7 +153,7 @@ class Framed(Around):
         """The mechanism's Jacobian, turned by the base and carried to the tool; see `Mechanism.jacobian`."""
         values = self.resolve(parameters)
         base, inner, tool = self._split(values)
-        near = None if guess is None else self.mechanism.pose_near(*self._unseen(guess, values))
+        near = None if guess is None else self.mechanism.pose_near(*self.unseen(guess, values))
         rows = self.mechanism.jacobian(joints, inner, near)
         turn = rotation_vector_to_matrix(base[..., 3:])
         linear = turn @ rows[..., :3, :]
@@ -224,7 +241,11 @@ class Framed(Around):
             values[..., last:] if self.tool else none,
         )
 
-    def _seen(self, inner_pose: Tensor, values: Tensor) -> Tensor:
+    def own_values(self, values: Tensor) -> Tensor:
+        """Of the parameters `... x k` those of the mechanism inside."""
+        return self._split(values)[1]
+
+    def seen(self, inner_pose: Tensor, values: Tensor) -> Tensor:
         """The mechanism's pose as the measuring device sees it, `... x p`."""
         base, _, tool = self._split(values)
         position, rotation = self.mechanism.frame(inner_pose)
@@ -233,12 +254,12 @@ class Framed(Around):
         whole = compose(compose(_transform(base), (rotation, position)), _transform(tool))
         return _coordinates(whole[1], whole[0])
 
-    def _unseen(self, pose: Tensor, values: Tensor) -> Frame:
+    def unseen(self, pose: Tensor, values: Tensor) -> Frame:
         """The frame in the mechanism's base that the measuring device sees as the pose."""
         return self._unframed(self.frame(pose), values)
 
     def _unframed(self, seen: Frame, values: Tensor) -> Frame:
-        """As `_unseen`, of a frame."""
+        """As `unseen`, of a frame."""
         base, _, tool = self._split(values)
         position, rotation = seen
         turn = rotation_vector_to_matrix(base[..., 3:]).mT
@@ -250,7 +271,7 @@ class Framed(Around):
 
     def _closest(self, pose: Tensor, values: Tensor, rotation_weight: float) -> Tensor:
         """The mechanism's pose whose frame is closest to the measured one, `... x p'`, differentiable."""
-        target = self._unseen(pose, values)
+        target = self.unseen(pose, values)
         start = self.mechanism.pose_near(*target)
         if self._plain:
             return start

@@ -15,6 +15,7 @@ from ccnn_torch.mechanisms.frames.fit import fit_frames
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.frames.partial import Seen
 from ccnn_torch.mechanisms.frames.readings import Place, Reading, make_reading
+from ccnn_torch.mechanisms.frames.set_ups import fit_set_ups
 from ccnn_torch.mechanisms.machines.links import compose
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
@@ -54,11 +55,11 @@ class Instrument(Seen):
             raise InputError(f"link: {link} is no link of {mechanism.name}; {what}")
         if link is not None and not reading.on_links:
             raise InputError(f"link: how a {reading.kind} sits on a link has no parameters; only a level may be on one")
-        at_home = place_of(mechanism, link, mechanism.home_joints, mechanism.nominal)
-        if reading.turns and at_home.rotation is None:
-            raise InputError(f"mechanism '{mechanism.name}' has no orientation, which a {reading.kind} on it needs")
         own = torch.tensor([p.nominal for p in reading.parameters], dtype=torch.float64)
         usual = torch.tensor(reading.usual, dtype=torch.float64)
+        at_home = _place(mechanism, link, reading, mechanism.home_joints, mechanism.nominal, usual)
+        if reading.turns and at_home.rotation is None:
+            raise InputError(f"mechanism '{mechanism.name}' has no orientation, which a {reading.kind} on it needs")
         home = [*reading(at_home, own, usual).tolist(), *reading.usual]
         super().__init__(mechanism, [*reading.read, *reading.given], home, reading.parameters)
         self.reading, self.link, self.known = reading, link, False
@@ -74,8 +75,8 @@ class Instrument(Seen):
         if self.known:
             return ()
         unknown: tuple[str, ...] = getattr(self.mechanism, "unknown_frames", ())
-        unknown = unknown if self.link is None else tuple(name for name in unknown if name != "tool")
-        return (*unknown, *self.reading.unknown)
+        blind = self.reading.blind if self.link is None else ("tool",)
+        return (*(name for name in unknown if name not in blind), *self.reading.unknown)
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
         """As of a mechanism; nothing is unknown any more where values are not those that it was made with."""
@@ -97,12 +98,35 @@ class Instrument(Seen):
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
         """What is read with these joints, and what is given by `guess` (home without), `... x p` [SI]."""
-        values = self.resolve(parameters)
-        count = len(self.mechanism.geometry)
-        given = (self.home_pose if guess is None else guess)[..., self.compared :]
-        there = place_of(self.mechanism, self.link, joints, values[..., :count])
-        read = self.reading(there, values[..., count:], given)
+        there, own, given = self._rows(joints, parameters, guess)
+        read = self.reading(there, own, given)
         return torch.cat([read, given.expand(*read.shape[:-1], -1)], -1)
+
+    def _rows(self, joints: Tensor, parameters: Tensor | None, guess: Tensor | None) -> tuple[Place, Tensor, Tensor]:
+        """Where what holds the instrument is, the instrument's own parameters, and what is given."""
+        values, count = self.resolve(parameters), len(self.mechanism.geometry)
+        given = self.given(guess)
+        there = _place(self.mechanism, self.link, self.reading, joints, values[..., :count], given)
+        return there, values[..., count:], given
+
+    def given(self, rows: Tensor | None) -> Tensor:
+        """What the rows `... x p` were of, `... x g` [SI]; what is usual where there are none."""
+        return (self.home_pose if rows is None else rows)[..., self.compared :]
+
+    def places(self, joints: Tensor, rows: Tensor | None) -> list[Tensor]:
+        """Of rows whose reading is of two places, both."""
+        return [joints, self.given(rows).expand_as(joints)] if self.reading.twice else [joints]
+
+    def sample_given(self, count: int, generator: torch.Generator) -> Tensor:
+        """Rows of any anchor, plane or second place, `count x p` [SI]; nothing is read yet."""
+        rows, groups = self.home_pose.expand(count, -1), torch.tensor(self.reading.groups, dtype=torch.float64)
+        if self.reading.twice:
+            given = self.mechanism.sample_joints(count, generator)
+        elif len(groups):
+            given = groups[torch.randint(len(groups), (count, 1), generator=generator)]
+        else:
+            return rows
+        return torch.cat([rows[:, : self.compared], given], -1)
 
     def frame(self, pose: Tensor) -> Frame:
         """What is read: lengths as a position, angles as a rotation vector."""
@@ -114,15 +138,13 @@ class Instrument(Seen):
 
     def by_place(self, joints: Tensor, parameters: Tensor | None, guess: Tensor | None) -> Tensor:
         """Change of `frame` by a shift and a turn (about its own point) of what holds the instrument, `... x c x 6`."""
-        values, count = self.resolve(parameters), len(self.mechanism.geometry)
-        there = place_of(self.mechanism, self.link, joints, values[..., :count])
-        given = (self.home_pose if guess is None else guess)[..., self.compared :]
+        there, own, given = self._rows(joints, parameters, guess)
 
         def read(twist: Tensor) -> Tensor:
             turned = there.rotation
             if turned is not None:
                 turned = rotation_vector_to_matrix(twist[..., 3:]) @ turned
-            return self.reading(Place(there.position + twist[..., :3], turned, joints), values[..., count:], given)
+            return self.reading(there._replace(position=there.position + twist[..., :3], rotation=turned), own, given)
 
         slope = jacobian_of(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype))[1]
         slope = torch.nn.functional.pad(slope, (0, 0, 0, 3 - self.compared))
@@ -165,21 +187,35 @@ class Instrument(Seen):
             stands, poses = self.reading.frames(q, x, start[count:])
             if poses is not None:
                 start[:count] = fit_frames(arm, stands, poses)
-        there = place_of(arm, self.link, q, start[:count])
+        there = _place(arm, self.link, self.reading, q, start[:count], self.given(x))
         start[count:] = self.reading.start(there, x, start[count:])
         kept = torch.ones(len(q), dtype=torch.float64)
         for _ in range(_ROUNDS):
 
             def gap(values: Tensor, kept: Tensor = kept, start: Tensor = start) -> Tensor:
-                full = start.index_copy(0, torch.tensor(free), values)
+                full = start.expand(*values.shape[:-1], -1).index_copy(-1, torch.tensor(free), values)
                 left = self.forward_kinematics(q, full, x) - x
-                return (left[:, : self.compared] * kept[:, None]).flatten()
+                return left[:, : self.compared] * kept[:, None]
 
-            found = levenberg_marquardt(gap, start[free], lambda v, gap=gap: jacobian_of(gap, v)[1], max_iterations=100)
+            found = levenberg_marquardt(
+                lambda v, gap=gap: gap(v).flatten(),
+                start[free],
+                # A row's residual is of its own copy of the values: one pass for each reading and not for each row.
+                lambda v, gap=gap: jacobian_of(gap, v.expand(len(q), -1))[1].flatten(0, 1),
+                max_iterations=100,
+            )
             start = start.index_copy(0, torch.tensor(free), found.value)
             left = self.forward_kinematics(q, start, x)[:, : self.compared] - x[:, : self.compared]
             kept = inlying(left.norm(dim=-1).nan_to_num(nan=torch.inf), kept >= 0, self.compared, len(free)).double()
         return start
+
+
+def _place(
+    mechanism: Mechanism, link: int | None, reading: Reading, joints: Tensor, values: Tensor, given: Tensor
+) -> Place:
+    """Where what holds an instrument is, also with the joints that are given where its reading is of two places."""
+    there = place_of(mechanism, link, joints, values)
+    return there._replace(second=place_of(mechanism, link, given, values).position) if reading.twice else there
 
 
 def place_of(mechanism: Mechanism, link: int | None, joints: Tensor, values: Tensor) -> Place:
@@ -206,6 +242,8 @@ def fit_unknown(
     if isinstance(mechanism, SerialArm):
         return fit_frames(mechanism, joints, pose, weights, columns=columns)
     if isinstance(mechanism, Framed):
+        if mechanism.grouped:
+            return fit_set_ups(mechanism, joints, pose, weights, columns)
         return mechanism.inlying_frames(joints, pose, weights)
     assert isinstance(mechanism, Instrument)
     return mechanism.fitted(joints, pose, weights)

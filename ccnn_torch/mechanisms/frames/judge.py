@@ -113,7 +113,7 @@ def coupled_count(arm: SerialArm, joints: Tensor, pose: Tensor) -> str | None:
     Returns:
         `q3 - q2` or `q3 + q2`; None where neither fits, or frames are by group.
     """
-    if len(arm.joints) < 3 or arm.frame_per or arm.tool_per:
+    if len(arm.joints) < 3 or arm.grouped:
         return None
     left = {}
     for text, sign in (("q3", 0.0), ("q3 - q2", -1.0), ("q3 + q2", 1.0)):

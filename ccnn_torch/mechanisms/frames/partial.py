@@ -34,7 +34,16 @@ class Seen(Around, ABC):
     def __init__(
         self, mechanism: Mechanism, pose: Sequence[Coordinate], home: Sequence[float], own: Sequence[Parameter] = ()
     ) -> None:
-        """Take the mechanism, what is read and given, the row at home, and what else is unknown."""
+        """Take the mechanism, what is read and given, the row at home, and what else is unknown.
+
+        Raises:
+            InputError: the mechanism has frames per group of rows.
+        """
+        if mechanism.grouped:
+            raise InputError(
+                f"mechanism '{mechanism.name}' has frames per group of rows (frame_per, tool_per), which only whole "
+                "poses determine; leave the keys out, and give the rows of one group"
+            )
         inner = mechanism.with_nominal(mechanism.nominal)
         super().__init__(
             name=inner.name,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -14,7 +15,9 @@ from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.board import board_poses
 from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+from ccnn_torch.records.commanded import SECOND
 
 # Plausible errors: of a focal length and an image's centre as a share of it, of distortion, of a place that a tape
 # measured, of a mounting's turn.
@@ -23,16 +26,22 @@ PIXEL = 1e-6
 """A pixel counts as this length on the image [m], as columns in px are read."""
 # Numbers of a lens.
 _LENS = 6
+# Rows of an anchor or a plane.
+_FEWEST = 4
 # Nothing is seen nearer to a camera than this [m].
 _BEHIND = 1e-3
 
 
 class Place(NamedTuple):
-    """Position `... x 3` [m] and rotation `... x 3 x 3` (or None) of what holds the instrument, joints `... x n`."""
+    """Position `... x 3` [m] and rotation `... x 3 x 3` (or None) of what holds the instrument, joints `... x n`.
+
+    second: the position with the joints that are given, `... x 3` [m], where the reading is of two places.
+    """
 
     position: Tensor
     rotation: Tensor | None
     joints: Tensor
+    second: Tensor | None = None
 
 
 class Reading(ABC):
@@ -43,6 +52,9 @@ class Reading(ABC):
         keys: from which it was made.
         turns: whether it needs the orientation of what holds it.
         on_links: whether its parameters say how it sits on a link.
+        twice: whether it is of two places of one machine, alike in both; the joints of the second are given.
+        blind: frames of an arm that it never shows.
+        groups: numbers of its anchors or planes in the column that is given.
         read: what it reads; all lengths or all angles, three at most.
         given: what it was pointed at, columns of the records.
         usual: of what is given, where no row says it [SI].
@@ -55,6 +67,9 @@ class Reading(ABC):
     note = ""
     turns = False
     on_links = False
+    twice = False
+    blind: tuple[str, ...] = ()
+    groups: Sequence[float] = ()
     keys: dict[str, Any]
     read: tuple[Coordinate, ...]
     given: tuple[Coordinate, ...] = ()
@@ -108,7 +123,7 @@ class Camera(Reading):
         A board whose corners are known only to `board_tolerance` [m] has so many `corners`, which the column `corner`
         numbers from 1.
         """
-        self.corners = _count(corners, "corners") if corners else 0
+        self.corners = len(_numbers(corners, "corners")) if corners else 0
         self.on_hand, self.unknown = on_hand, ("camera",) if refine else ()
         focus = fx if fy is None else fy
         self.keys = {"fx": fx, "cx": cx, "cy": cy, "fy": focus, "k1": k1, "k2": k2, "on_hand": on_hand}
@@ -133,7 +148,7 @@ class Camera(Reading):
         assert place.rotation is not None
         point = given[..., :3]
         if self.corners:
-            point = point + _chosen(own[..., _LENS:], given[..., 3], 3)
+            point = point + _chosen(own[..., _LENS:], given[..., 3], 3, _numbers(self.corners, "corners"))
         if self.on_hand:
             seen = (place.rotation.mT @ (point - place.position)[..., None])[..., 0]
         else:
@@ -162,32 +177,49 @@ class Wire(Reading):
     kind = "wire"
     read = (Coordinate("distance", "m"),)
     given = (Coordinate("anchor", "1"),)
-    usual = (1.0,)
 
-    def __init__(self, anchors: int = 1) -> None:
-        """How many anchors there are; the column `anchor` numbers them from 1."""
-        self.anchors = _count(anchors, "anchors")
+    def __init__(self, anchors: int | Sequence[float] = 1) -> None:
+        """How many anchors there are, which the column `anchor` numbers from 1; or their numbers there."""
+        self.groups = _numbers(anchors, "anchors")
         self.keys = {"anchors": anchors}
-        self.unknown = tuple(f"anchor{i + 1}" for i in range(self.anchors))
+        self.unknown = tuple(f"anchor{n:g}" for n in self.groups)
+        self.usual = (self.groups[0],)
         self.parameters = tuple(
             Parameter(f"{name}_{axis}", "m", 0.0, scale=_PLACE) for name in self.unknown for axis in "xyz"
         )
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
-        length: Tensor = (place.position - _chosen(own, given[..., 0], 3)).square().sum(-1, keepdim=True)
-        return (length + 1e-24).sqrt()
+        return _apart(place.position, _chosen(own, given[..., 0], 3, self.groups))
 
     def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
         """|p|² - d² = 2 p·a - |a|² is linear in a and |a|²."""
         found = own.clone()
-        for i in range(self.anchors):
-            p, d = place.position[rows[:, 1] == i + 1], rows[rows[:, 1] == i + 1, 0]
-            if len(p) < 4:
-                raise InputError(f"anchor {i + 1}: needs at least 4 rows, got {len(p)}; measure it more often")
+        for i, (p, d) in enumerate(_by_group(place, rows, self.groups, "anchor")):
             left = torch.cat([2 * p, -torch.ones_like(p[:, :1])], dim=-1)
             right = (p.square().sum(-1) - d.square())[:, None]
             found[3 * i : 3 * i + 3] = torch.linalg.lstsq(left, right, driver="gelsd").solution[:3, 0]
         return found
+
+
+class Between(Reading):
+    """Distance of two places that the machine itself reached: a scale bar, a tape between holes, a printed part."""
+
+    kind = "between"
+    twice = True
+    blind = ("base",)
+    read = (Coordinate("distance", "m"),)
+    unknown = ()
+    parameters = ()
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        """The columns of the second place's joints are those of the first and `_b`."""
+        self.keys = {}
+        self.given = tuple(replace(j, name=f"{j.name}{SECOND}") for j in mechanism.joints)
+        self.usual = tuple(mechanism.home_joints.tolist())
+
+    def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
+        assert place.second is not None
+        return _apart(place.position, place.second)
 
 
 class Dial(Reading):
@@ -196,17 +228,21 @@ class Dial(Reading):
     kind = "dial"
     read = (Coordinate("reading", "m"),)
     given = (Coordinate("plane", "1"),)
-    usual = (1.0,)
 
-    def __init__(self, normals: Sequence[Sequence[float]] = ((0.0, 0.0, 1.0),)) -> None:
-        """The normal of each plane, roughly, in the measuring frame; the column `plane` numbers them from 1."""
+    def __init__(
+        self, normals: Sequence[Sequence[float]] = ((0.0, 0.0, 1.0),), planes: Sequence[float] | None = None
+    ) -> None:
+        """The normal of each plane, roughly, in the measuring frame; and the planes' numbers in the column `plane`,
+        from 1 when None."""
         axes = torch.tensor([list(map(float, n)) for n in normals], dtype=torch.float64)
         if axes.dim() != 2 or axes.shape[-1] != 3 or bool((axes.norm(dim=-1) == 0).any()):
             raise InputError(f"normals: write a direction x, y, z for each plane, not {normals!r}")
-        self.keys = {"normals": [list(n) for n in normals]}
+        self.groups = _numbers(len(axes) if planes is None else planes, "planes", len(axes))
+        self.keys = {"normals": [list(n) for n in normals], "planes": self.groups}
+        self.usual = (self.groups[0],)
         full = torch.linalg.svd(axes[:, None], full_matrices=True)[2]
         self.axes = torch.cat([axes[:, None] / axes.norm(dim=-1)[:, None, None], full[:, 1:]], 1)
-        self.unknown = tuple(f"plane{i + 1}" for i in range(len(axes)))
+        self.unknown = tuple(f"plane{n:g}" for n in self.groups)
         self.parameters = tuple(
             Parameter(f"{name}_{part}", unit, 0.0, scale=scale)
             for name in self.unknown
@@ -214,11 +250,18 @@ class Dial(Reading):
         )
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
-        mine = _chosen(own, given[..., 0], 3)
-        axes = self.axes[_number(given[..., 0], len(self.axes))]
+        mine = _chosen(own, given[..., 0], 3, self.groups)
+        axes = self.axes[_number(given[..., 0], self.groups)]
         turn = (mine[..., 1:, None] * axes[..., 1:, :]).sum(-2)
         normal = (rotation_vector_to_matrix(turn) @ axes[..., 0, :, None])[..., 0]
         return (place.position * normal).sum(-1, keepdim=True) - mine[..., :1]
+
+    def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
+        """The heights; the normals as they are."""
+        found = own.clone()
+        for i, (p, r) in enumerate(_by_group(place, rows, self.groups, "plane")):
+            found[3 * i] = (p @ self.axes[i, 0] - r).mean()
+        return found
 
 
 class Level(Reading):
@@ -255,13 +298,13 @@ class Encoder(Reading):
     kind = "encoder"
     unknown = ("encoder",)
 
-    def __init__(self, joint: str, joints: Sequence[Coordinate]) -> None:
+    def __init__(self, joint: str, mechanism: Mechanism) -> None:
         """The joint; its column is the joint's name and `_second`."""
-        names = [j.name for j in joints]
+        names = [j.name for j in mechanism.joints]
         if joint not in names:
             raise InputError(f"joint: there is no joint {joint!r}; write one of {', '.join(names)}")
         self.number = names.index(joint)
-        unit = joints[self.number].unit
+        unit = mechanism.joints[self.number].unit
         self.keys = {"joint": joint}
         self.read = (Coordinate(f"{joint}_second", unit),)
         self.parameters = (Parameter("encoder_offset", unit, 0.0, scale=_PLACE if unit == "m" else _TURN),)
@@ -270,7 +313,7 @@ class Encoder(Reading):
         return place.joints[..., self.number : self.number + 1] + own
 
 
-READINGS: dict[str, Callable[..., Reading]] = {c.kind: c for c in (Camera, Wire, Dial, Level, Encoder)}
+READINGS: dict[str, Callable[..., Reading]] = {c.kind: c for c in (Camera, Wire, Dial, Level, Encoder, Between)}
 """Instruments by name."""
 
 
@@ -282,31 +325,56 @@ def make_reading(kind: str, keys: Mapping[str, Any], mechanism: Mechanism) -> Re
     """
     if kind not in READINGS:
         raise InputError(f"kind: there is no instrument {kind!r}; write one of {', '.join(READINGS)}")
-    takes = [name for name in inspect.signature(READINGS[kind]).parameters if name != "joints"]
+    asks = [*inspect.signature(READINGS[kind]).parameters]
+    takes = [name for name in asks if name != "mechanism"]
     wrong = [name for name in keys if name not in takes]
     if wrong:
-        raise InputError(f"mechanism 'instrument': a {kind} has no key {wrong[0]!r}; it has {', '.join(takes)}")
-    more = {"joints": mechanism.joints} if kind == "encoder" else {}
+        there = ", ".join(takes) or "none"
+        raise InputError(f"mechanism 'instrument': a {kind} has no key {wrong[0]!r}; it has {there}")
+    more = {"mechanism": mechanism} if "mechanism" in asks else {}
     try:
         return READINGS[kind](**keys, **more)
     except TypeError as reason:
         raise InputError(f"mechanism 'instrument': {kind}: {reason}; its keys are {', '.join(takes)}") from None
 
 
-def _count(value: int, key: str) -> int:
-    if not isinstance(value, int) or not 1 <= value <= 100:
-        raise InputError(f"{key}: {value!r} is no number of them; write 1 to 100")
-    return value
+def _apart(here: Tensor, there: Tensor) -> Tensor:
+    """Distance of points, `... x 1` [m], with a derivative where it is 0."""
+    square: Tensor = (here - there).square().sum(-1, keepdim=True)
+    return (square + 1e-24).sqrt()
 
 
-def _number(column: Tensor, count: int) -> Tensor:
-    """The number from 0 of each row's group; what is no group is the nearest."""
-    return (column.round() - 1).clamp(0, count - 1).to(torch.int64)
+def _numbers(given: int | Sequence[float], key: str, count: int | None = None) -> list[float]:
+    """Numbers of groups: 1, 2 … where only how many is given; count: how many there have to be."""
+    found = [float(n) for n in (range(1, given + 1) if isinstance(given, int) else given)]
+    if not 1 <= len(found) <= 100 or len(set(found)) < len(found) or len(found) != (count or len(found)):
+        raise InputError(f"{key}: {given!r} is no number of them; write 1 to 100")
+    return found
 
 
-def _chosen(own: Tensor, column: Tensor, width: int) -> Tensor:
+def _number(column: Tensor, groups: Sequence[float]) -> Tensor:
+    """Which of the groups each row is of, from 0; what is no group's number is the nearest's."""
+    return (column[..., None] - torch.tensor(groups, dtype=column.dtype)).abs().argmin(-1)
+
+
+def _chosen(own: Tensor, column: Tensor, width: int, groups: Sequence[float]) -> Tensor:
     """Of the parameters of all groups `... x (g w)` those of each row's, `... x w`."""
-    number = _number(column, own.shape[-1] // width)
-    lead = torch.broadcast_shapes(own.shape[:-1], number.shape)  # type: ignore[no-untyped-call]
-    index = (number[..., None] * width + torch.arange(width)).expand(*lead, width)
-    return own.expand(*lead, -1).gather(-1, index)
+    number = _number(column, groups)
+    index = number[..., None] * width + torch.arange(width)
+    return expand_leading(own, index).gather(-1, expand_leading(index, own))
+
+
+def _by_group(place: Place, rows: Tensor, groups: Sequence[float], what: str) -> Iterator[tuple[Tensor, Tensor]]:
+    """Positions `t x 3` and readings `t` of each group, whose number is the second column of the rows.
+
+    Raises:
+        InputError: a group of fewer than four rows.
+    """
+    for i, label in enumerate(groups):
+        mine = _number(rows[:, 1], groups) == i
+        if int(mine.sum()) < _FEWEST:
+            raise InputError(
+                f"{what} {label:g}: needs at least {_FEWEST} rows that count, got {int(mine.sum())}; measure it more "
+                "often, or leave its rows out of the records"
+            )
+        yield place.position[mine], rows[mine, 0]

@@ -1,4 +1,4 @@
-"""An arm that was measured in several set-ups: by group of rows another place of the measuring device, another tool."""
+"""A machine in several set-ups: by group of rows another place of the measuring device, another tool."""
 
 from __future__ import annotations
 
@@ -11,94 +11,105 @@ from numpy.typing import NDArray
 from torch import Tensor, unflatten
 
 from ccnn_torch.coordinates import Coordinate, Parameter
-from ccnn_torch.mechanisms.frames.fit import groups_of
+from ccnn_torch.mechanisms.frames.fit import check_rows_of, groups_of
+from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.mechanisms.pose import Frame
+from ccnn_torch.mechanisms.pose import Frame, frame_gap
+from ccnn_torch.numerics.least_squares import levenberg_marquardt
+from ccnn_torch.numerics.outliers import inlying
 
 
 class SetUps(Mechanism):
-    """An arm with a base frame for each group of `frame_per`, and a tool frame for each of `tool_per`.
+    """An arm or a framed machine with a base frame for each group of `frame_per`, a tool frame for each of `tool_per`.
 
-    Its joints are those of the arm and, as the last column, the number of the row's set-up (`numbers`). Its parameters
-    in order: the base frames, the arm's links, the tool frames, named as the arm's with the group behind,
-    `base_x station 2`; a frame that all rows share is named as the arm's.
+    Its joints are those of the machine and, as the last column, the number of the row's set-up. Its parameters
+    in order: the base frames, the machine's own, the tool frames, named as the machine's with the group behind,
+    `base_x station 2`; a frame that all rows share is named as the machine's.
 
     Attributes:
-        arm: with one base and one tool frame.
+        machine: with one base and one tool frame.
     """
 
-    def __init__(self, arm: SerialArm, bases: Sequence[str], tools: Sequence[str]) -> None:
+    def __init__(self, machine: SerialArm | Framed, bases: Sequence[str], tools: Sequence[str]) -> None:
         """bases, tools: what each group is called; one each where all rows share a frame."""
         self._counts = len(bases), len(tools)
+        base, tool = (True, True) if isinstance(machine, SerialArm) else (machine.base, machine.tool)
+        # Of a base frame and of a tool frame.
+        self._sizes: tuple[int, int] = 6 * base, 6 * tool
 
         def of(part: Sequence[Parameter], groups: Sequence[str], named: bool) -> list[Parameter]:
             each = product(groups, part)
             return [Parameter(f"{p.name} {g}" if named else p.name, p.unit, p.nominal) for g, p in each]
 
-        base, links, tool = arm.geometry[:6], arm.geometry[6:-6], arm.geometry[-6:]
+        first, last = self._sizes[0], len(machine.geometry) - self._sizes[1]
         super().__init__(
-            name=arm.name,
-            joints=[*arm.joints, Coordinate("set-up", "1")],
-            pose=arm.pose,
-            geometry=[*of(base, bases, bool(arm.frame_per)), *links, *of(tool, tools, bool(arm.tool_per))],
-            low=arm.low.tolist(),
-            high=arm.high.tolist(),
-            home_pose=arm.home_pose.tolist(),
-            home_joints=[*arm.home_joints.tolist(), 0.0],
+            name=machine.name,
+            joints=[*machine.joints, Coordinate("set-up", "1")],
+            pose=machine.pose,
+            geometry=[
+                *of(machine.geometry[:first], bases, bool(machine.frame_per)),
+                *machine.geometry[first:last],
+                *of(machine.geometry[last:], tools, bool(machine.tool_per)),
+            ],
+            low=machine.low.tolist(),
+            high=machine.high.tolist(),
+            home_pose=machine.home_pose.tolist(),
+            home_joints=[*machine.home_joints.tolist(), 0.0],
         )
-        self.arm = arm
-        self.orientations = arm.orientations
+        self.machine = machine
+        self.orientations = machine.orientations
         # Declared values are not the nominal ones of an arm whose frames were found before.
         every = torch.arange(len(bases) * len(tools))
-        self.nominal.copy_(self.parameters_of(arm.nominal.expand(len(every), -1), every))
+        self.nominal.copy_(self.parameters_of(machine.nominal.expand(len(every), -1), every))
 
     def parameters_of(self, values: Tensor, numbers: Tensor) -> Tensor:
-        """All parameters `K` of those of the arm in rows of every group, `s x k`; numbers: of their set-ups, `s`."""
-        bases, tools = self._counts
-        base = [values[numbers // tools == b][0, :6] for b in range(bases)]
-        tool = [values[numbers % tools == t][0, -6:] for t in range(tools)]
-        return torch.cat([*base, values[0, 6:-6], *tool])
+        """All parameters `... x K` of the machine's in rows of every group, `... x s x k`; numbers: of set-ups, `s`."""
+        (bases, tools), first, last = self._counts, self._sizes[0], values.shape[-1] - self._sizes[1]
+        base = [values[..., numbers // tools == b, :first][..., 0, :] for b in range(bases)]
+        tool = [values[..., numbers % tools == t, last:][..., 0, :] for t in range(tools)]
+        return torch.cat([*base, values[..., 0, first:last], *tool], -1)
 
     def of_rows(self, numbers: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """The arm's parameters in set-ups `... x s`, `... x s x k`; parameters: `... x 1 x K` or alike."""
+        """The machine's parameters in set-ups `... x s`, `... x s x k`; parameters: `... x 1 x K` or alike."""
         values, (bases, tools) = self.resolve(parameters), self._counts
         number = numbers.detach().round().long()
+        of_base, of_tool = self._sizes
+        first, last = bases * of_base, values.shape[-1] - tools * of_tool
         base, tool = (
             (torch.nn.functional.one_hot(which, count).to(values.dtype).unsqueeze(-2) @ part).squeeze(-2)
             for which, count, part in (
-                (number // tools, bases, unflatten(values[..., : 6 * bases], -1, (bases, 6))),
-                (number % tools, tools, unflatten(values[..., -6 * tools :], -1, (tools, 6))),
+                (number // tools, bases, unflatten(values[..., :first], -1, (bases, of_base))),
+                (number % tools, tools, unflatten(values[..., last:], -1, (tools, of_tool))),
             )
         )
-        links = values[..., 6 * bases : -6 * tools].expand(*base.shape[:-1], -1)
-        return torch.cat([base, links, tool], -1)
+        own = values[..., first:last].expand(*base.shape[:-1], -1)
+        return torch.cat([base, own, tool], -1)
 
-    def one(self, parameters: Tensor) -> SerialArm:
-        """The arm in the first set-up, of parameters `K`."""
-        arm = self.arm.with_nominal(self.of_rows(torch.zeros(()), parameters))
-        assert isinstance(arm, SerialArm)
-        return arm
+    def one(self, parameters: Tensor) -> Mechanism:
+        """The machine in the first set-up, of parameters `K`."""
+        return self.machine.with_nominal(self.of_rows(torch.zeros(()), parameters))
 
     def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As of the arm, each row in its set-up."""
-        return self.arm.forward_frame(joints[..., :-1], self.of_rows(joints[..., -1], parameters))
+        """As of an arm, each row in its set-up."""
+        assert isinstance(self.machine, SerialArm)
+        return self.machine.forward_frame(joints[..., :-1], self.of_rows(joints[..., -1], parameters))
 
     def forward_kinematics(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
-        """As of the arm, each row in its set-up."""
-        return self.arm.forward_kinematics(joints[..., :-1], self.of_rows(joints[..., -1], parameters), guess)
+        """As of the machine, each row in its set-up."""
+        return self.machine.forward_kinematics(joints[..., :-1], self.of_rows(joints[..., -1], parameters), guess)
 
     def frame(self, pose: Tensor) -> Frame:
-        """As of the arm."""
-        return self.arm.frame(pose)
+        """As of the machine."""
+        return self.machine.frame(pose)
 
 
 def set_ups(
-    arm: SerialArm, columns: Mapping[str, NDArray[np.float64]], rows: int
+    machine: SerialArm | Framed, columns: Mapping[str, NDArray[np.float64]] | None, rows: int
 ) -> tuple[SetUps, Tensor, list[tuple[str, Tensor]]]:
-    """The arm in the set-ups of its rows, the number of each row's, `s`, and the rows of each group, by its name.
+    """The machine in the set-ups of its rows, the number of each row's, `s`, and the rows of each group, by its name.
 
     Args:
         columns: of the records, `s` each; those of `frame_per` and `tool_per` are among them.
@@ -107,7 +118,61 @@ def set_ups(
     Raises:
         InputError: a column that is not there.
     """
-    base_of, bases = groups_of(arm, "frame_per", arm.frame_per, columns, rows)
-    tool_of, tools = groups_of(arm, "tool_per", arm.tool_per, columns, rows)
+    base_of, bases = groups_of(machine, "frame_per", machine.frame_per, columns, rows)
+    tool_of, tools = groups_of(machine, "tool_per", machine.tool_per, columns, rows)
     groups = [(n, of == i) for of, names in ((base_of, bases), (tool_of, tools)) for i, n in enumerate(names)]
-    return SetUps(arm, bases, tools), base_of * len(tools) + tool_of, groups
+    return SetUps(machine, bases, tools), base_of * len(tools) + tool_of, groups
+
+
+# Rounds in which gross outliers are left out.
+_ROUNDS = 3
+
+
+def fit_set_ups(
+    machine: Framed,
+    joints: Tensor,
+    pose: Tensor,
+    weights: Tensor | None = None,
+    columns: Mapping[str, NDArray[np.float64]] | None = None,
+) -> Tensor:
+    """All parameters of a framed machine in every row with the frames of its group fitted, `... x s x k`.
+
+    Closed forms for each set-up alone; where set-ups have a frame in common, least squares from there.
+
+    Args:
+        joints, pose: `s x n`, `s x p` [SI]; a row that lacks a part of its pose (NaN) is left out.
+        weights: `... x s`; 0 leaves a row out.
+        columns: of the records, `s` each.
+
+    Raises:
+        InputError: a column that is not there, or a group with fewer than three rows.
+    """
+    twin, number, groups = set_ups(machine, columns, len(joints))
+    weights = torch.ones(len(joints), dtype=joints.dtype) if weights is None else weights
+    weights, pose = torch.where(pose.isnan().any(-1), 0.0, weights), pose.nan_to_num()
+    for name, rows in groups:
+        check_rows_of(machine.name, name, weights[..., rows], 3)
+    count = int(number.max()) + 1
+    shares = weights[..., None, :] * (number == torch.arange(count)[:, None])
+    values = machine.inlying_frames(joints, pose, shares)[..., number, :]
+    if not (machine.base and machine.tool):
+        return values
+    # A frame in common starts as in the set-up with most rows.
+    order = torch.argsort(torch.bincount(number)[number], descending=True, stable=True)
+    start = twin.parameters_of(values[..., order, :], number[order])
+    inner, measured = machine.mechanism.pose_near(*machine.unseen(pose, values)), machine.frame(pose)
+    inner = machine.mechanism.forward_kinematics(joints, machine.own_values(machine.nominal), inner)
+    free = [k for k, p in enumerate(twin.geometry) if p.name.startswith(("base_", "tool_"))]
+    spread = torch.eye(len(twin.geometry), dtype=start.dtype)[free]
+
+    def gap(change: Tensor) -> Tensor:
+        whole = twin.of_rows(number, (start + change @ spread)[..., None, :])
+        return frame_gap(machine.frame(machine.seen(inner, whole)), measured, machine.rotation_weight)
+
+    change, fine = start.new_zeros(*start.shape[:-1], len(free)), weights
+    for _ in range(_ROUNDS):
+        kept = fine
+        change = levenberg_marquardt(lambda x, kept=kept: (kept[..., None] * gap(x)).flatten(-2), change).value
+        length = torch.linalg.vector_norm(gap(change), dim=-1).nan_to_num(nan=torch.inf)
+        fine = weights * inlying(length, weights > 0, len(machine.pose), len(free))
+    return twin.of_rows(number, (start + change @ spread)[..., None, :])

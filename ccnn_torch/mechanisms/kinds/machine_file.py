@@ -36,6 +36,7 @@ KINDS = tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 _BARE = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*")
 _TOLERANCE = re.compile(r"\+-|±")
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
+_OF_ARMS = ("base_frame", "tool_frame", "limits", "orientation", "frame_per", "tool_per")
 _FRAME = ("m", "m", "m", "rad", "rad", "rad")
 
 
@@ -78,7 +79,7 @@ def build_machine(content: Mapping[str, Any], where: str, makers: Mapping[str, C
     name = content["machine"]
     _check_names([str(name)], list(KINDS), f"{where}: machine:")
     about = _kind(name)
-    known = ["machine", "numbers", *(["base_frame", "tool_frame", "limits", "orientation"] if "chain" in about else [])]
+    known = ["machine", "numbers", *(_OF_ARMS if "chain" in about else [])]
     _check_names([str(key) for key in content], known, f"{where}: the key")
     given = content.get("numbers") or {}
     if not isinstance(given, Mapping):
@@ -127,9 +128,18 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         ],
         unknown_frames=[key for key, frame in frames.items() if frame is None],
         orientation=content.get("orientation", about.get("orientation", "rotation_vector")),
+        frame_per=_words(content, "frame_per", where),
+        tool_per=_words(content, "tool_per", where),
         drives=[(int(d[5]), int(d[6])) for e in about["numbers"].values() for d in e["of"] if d.startswith("drive")],
         numbers=numbers,
     )
+
+
+def _words(content: Mapping[str, Any], key: str, where: str) -> list[str]:
+    value = content.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise InputError(f"{where}: {key}: must be a list of columns, e.g. [station], not {value!r}")
+    return value
 
 
 def _parallel(

@@ -38,7 +38,7 @@ class Pair(Mechanism):
         for which, arm in arms.items():
             if not isinstance(arm, SerialArm):
                 raise InputError(f"mechanism 'pair': {which}: write the file of a serial arm; {arm.name} is none")
-            if arm.unknown_frames or arm.frame_per or arm.tool_per:
+            if arm.unknown_frames or arm.grouped:
                 raise InputError(
                     f"mechanism 'pair': {which}: the frames of {arm.name} are not known; give base_frame and "
                     "tool_frame in its file as [x, y, z, rx, ry, rz], at least roughly"

@@ -75,6 +75,9 @@ class Coefficient(Result):
     """the one joint, leg or link that it belongs to"""
     nominal: Number = None
     """what the model has, of a parameter of the mechanism; the value is the difference to it"""
+    together: int = 1
+    """of a parameter of the mechanism: how many of its effect's clearest numbers, entered together, leave no more than
+    1.2 times what is promised"""
     sense: str = ""
     """which way it counts, where that is not the usual one"""
     word: str = ""
@@ -241,5 +244,8 @@ class DiagnosisResults(Result):
     cautions: list[str]
     """signs that records and model do not fit each other, one sentence each; they stand in verdict.text as well"""
     notes: list[str]
+    frames: dict[str, list[float]] = {}
+    """how far an arm's base and tool, where they were fitted, are from the model's with the verdict's numbers in it:
+    shift [m] and rotation vector [rad], in the frame before. Errors of link 1's place and of the flange hide in them"""
     machine: FoundMachine | None = None
     """the machine with these effects, fitted together to all rows, as a compensator takes it"""

@@ -180,7 +180,7 @@ def _shrink(case: SourceCase, found: Diagnosis) -> dict[str, Any] | None:
     pose = torch.stack([torch.from_numpy(clean[c.header]) for c in situation.mechanism.pose], -1)
     if len(pose) != len(situation.joints):
         return None
-    keep = found.analysis.whitening.weight > 0
+    keep = found.analysis.whitening.counted
     before, after = (
         float(remainder(situation, pose, acting)[keep][:, :3].square().sum(-1).nanmean())
         for acting in ((), found.acting)

@@ -31,13 +31,14 @@ _WEAKEST, _STRONGEST, _STRONGEST_OF_TWO = 4.0, 30.0, 20.0
 """Causes in units of the noise."""
 _OUTLIER = frozenset({"outlier"})
 _BESIDE = {
-    "bump": ("frame",),
-    "sun": ("frame",),
-    "reclamp": ("tool", "frame"),
+    "sun": ("frame", "frame_drift"),
+    "reclamp": ("tool", "frame", "frame_drift"),
     "clampslip": ("tool", "frame"),
     "loose": ("compliance", "backlash"),
 }
 """Names that are no mistake beside "outside the library": the mean of what moves, the slope of what is loose."""
+_NAMED_SINCE = {"bump": "frame_drift"}
+"""Causes outside the library of the time that these cases were written, and their names in that of today."""
 _ENOUGH = {"loose": (frozenset({"backlash"}),)}
 """A loose joint that the load pushes to either side is play."""
 
@@ -133,6 +134,8 @@ def _truth(dealt: Dealt, causes: list[Cause]) -> Truth:
     name = dealt.causes[0]
     if dealt.kind == "none":
         return Truth("none", (), (frozenset(), _OUTLIER), False)
+    if name in _NAMED_SINCE:
+        return Truth("single", dealt.causes, (frozenset({_NAMED_SINCE[name]}),), False)
     if dealt.kind == "outside":
         beside = _BESIDE.get(name, ())
         accepted = tuple(frozenset(some) for k in range(len(beside) + 1) for some in combinations(beside, k))

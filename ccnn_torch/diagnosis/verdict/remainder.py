@@ -1,0 +1,280 @@
+"""Is what a verdict leaves noise? A test of the whole answer against everything that the rows record.
+
+What the named effects leave, in units of a robust noise of each channel and clipped, is compared with functions of each
+driver: smooth ones, in every channel and through every joint; own ones of a joint; products of two; steps at a row. The
+order of the rows is drawn anew for what would be found in noise (a permutation test; Freedman and Lane 1983), and the
+smallest probability counts for as many families as were tried.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.candidates.atom import scaled_signature, scales
+from ccnn_torch.diagnosis.discrepancy.local import CROSS
+from ccnn_torch.diagnosis.discrepancy.smooth import PLACE, driver_of, unit_range
+from ccnn_torch.diagnosis.residual.whitening import MAD
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.evidence.dictionary import FittedSet
+from ccnn_torch.evidence.form_error import form_error_of, is_unexplained
+
+# Values beyond this many robust standard deviations count as this many: tails are no structure.
+_CLIP, _SCALINGS = 2.5, 3
+# Degree of smooth functions, waves of a joint's own in its range, and parts that the order of the rows is cut into.
+_DEGREE, _WAVES, _PARTS = 5, (2, 3, 4, 5, 6, 7), 8
+_ORDERS = 199
+# Values that the test needs beyond those that its own functions take, and that it takes at most.
+_FEWEST, _MOST = 12, 3000
+# Share of a column that what is fitted leaves, from which it is one of its own; and of a block's largest direction.
+_OWN, _INDEPENDENT = 1e-6, 1e-8
+# Step in a shape, as a share of it, for what its error changes.
+_STEP = 1e-4
+
+
+class Remainder(NamedTuple):
+    """The strongest structure in what is left.
+
+    Attributes:
+        probability: of as strong a one in noise.
+        driver: what it follows, as a discrepancy term is called.
+        share: of the gap that it makes.
+    """
+
+    probability: float
+    driver: str
+    share: float
+
+
+class _Block(NamedTuple):
+    """Functions of a driver, `s x m`, in every channel, through every joint, or through one.
+
+    Attributes:
+        driver: what they follow.
+        family: those among which the strongest counts.
+        values: `s x m`.
+        through: "channels", "joints", or the number of a joint, "0" the first.
+    """
+
+    driver: str
+    family: str
+    values: Tensor
+    through: str
+
+
+# Probability below which a remainder is no noise, where it is more than the form errors of the effects would be along
+# so many directions.
+_UNLIKELY, _DIRECTIONS = 0.01, 20
+# So many times a known noise is not a noise that was stated a little too small.
+_MANY_TIMES = 2.0
+
+
+def rest_of(analysis: Analysis, found: FittedSet) -> tuple[str, ...] | None:
+    """What the remainder of a set follows; () where it is far more than a known noise and follows nothing; None where
+    it is noise, or nothing tells."""
+    rest = remainder_of(analysis, found)
+    allowed = _DIRECTIONS * form_error_of(found, analysis.dictionary) / analysis.gap
+    if rest and rest.probability < _UNLIKELY and rest.share > allowed:
+        return (rest.driver,)
+    return () if analysis.noise_is_known and times_the_noise(analysis, found) > _MANY_TIMES else None
+
+
+def times_the_noise(analysis: Analysis, found: FittedSet) -> float:
+    """Standard deviation of what a set leaves, over that of the noise; 1 where it is no clearly more than that."""
+    if not is_unexplained(analysis.dictionary, found, analysis.floor):
+        return 1.0
+    free = max(analysis.dictionary.grams.values - found.effective, 1.0)
+    return float((found.rss / free / max(analysis.floor, 1e-300)) ** 0.5)
+
+
+def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
+    """Test what a set leaves of the rows that count; None where they are too few.
+
+    Args:
+        analysis: of the rows.
+        found: the set.
+    """
+    rows, channels = analysis.dictionary.y.shape
+    order = torch.Generator().manual_seed(0)
+    taken = torch.randperm(rows, generator=order)[: max(_MOST // channels, 1)].sort().values
+    own = [analysis.fitted, *_of_effects(analysis, found), analysis.situation.jacobian]
+    target, *columns, jacobian = _whitened(analysis, [analysis.residual[..., None], *own], taken)
+    rows = len(taken)
+    scale = torch.ones(channels, dtype=torch.float64)
+    for _ in range(_SCALINGS):
+        basis = _basis(torch.cat([c * scale[:, None] for c in columns], -1).flatten(0, 1))
+        free = rows * channels - basis.shape[1]
+        if free < _FEWEST:
+            return None
+        y = (target[..., 0] * scale).flatten()
+        left = y - basis @ (basis.mT @ y)
+        used, spread = scale, MAD * left.reshape(rows, channels).abs().median(0).values
+        scale = used / (spread / (free / (rows * channels)) ** 0.5).clamp_min(1e-12)
+    clipped = left.clamp(-_CLIP, _CLIP)
+    by_row = (clipped - basis @ (basis.mT @ clipped)).reshape(rows, channels)
+    drawn = [by_row[torch.randperm(rows, generator=order)].flatten() for _ in range(_ORDERS)]
+    every = torch.stack([by_row.flatten(), left, *drawn], -1)
+    total = every.square().sum(0) - (basis.mT @ every).square().sum(0)
+    jacobian = jacobian * used[:, None]
+    blocks = [*_blocks(_drivers(analysis, analysis.whitening.keep()[taken]))]
+    best: dict[str, Tensor] = {}
+    strongest = -torch.inf, "", 0.0
+    for block, explained, count in _explained(blocks, jacobian, basis, every):
+        if not count or free - count < _FEWEST:
+            continue
+        ratio = (explained / count) / ((total - explained).clamp_min(1e-300) / (free - count))
+        score = _surprise(ratio, count, free - count)
+        best[block.family] = torch.maximum(score, best.get(block.family, score))
+        # Of many drivers that go together the one that needs least for it (Schwarz 1978).
+        evidence = float(free * (total / (total - explained))[0].log() - count * math.log(free)) / 2
+        extra = float(explained[1] - count * (total[1] - explained[1]) / (free - count))
+        strongest = max(strongest, (evidence, block.driver, extra))
+    if not best:
+        return None
+    smallest = min(_tail(float(score[0]), score[2:]) for score in best.values())
+    _, driver, extra = strongest
+    frames = _basis((columns[0] * used[:, None]).flatten(0, 1))
+    gap = float(y.square().sum() - (frames.mT @ y).square().sum()) - rows * channels
+    parts = dict.fromkeys(PLACE if part.startswith(PLACE) else part for part in driver.split(CROSS))
+    return Remainder(min(1.0, len(best) * smallest), CROSS.join(parts), extra / max(gap, 1.0))
+
+
+def _drivers(analysis: Analysis, keep: Tensor) -> Mapping[str, Tensor]:
+    """Drivers in some rows, each `t` in [-1, 1]: joints, place, order of the rows, covariates, directions."""
+    situation = analysis.situation
+    found = {f"joint {j.name}": situation.joints[keep, i] for i, j in enumerate(situation.mechanism.joints)}
+    place = situation.place[keep]
+    found |= {f"{PLACE} {i}": place[:, i] for i in range(place.shape[-1])}
+    found["time"] = torch.arange(len(keep), dtype=torch.float64)
+    named = {driver_of(name): value[keep] for name, value in situation.covariates.items()}
+    found |= {name: value for name, value in named.items() if name and not name.startswith("speed") and name != "time"}
+    if not any(name.startswith("direction") for name in found):
+        step = situation.joints[keep].diff(dim=0, prepend=situation.joints[keep][:1])
+        found |= {f"direction {i + 1}": torch.where(step[:, i] < 0, -1.0, 1.0).double() for i in range(step.shape[-1])}
+    return {n: unit_range(v[:, None])[:, 0] for n, v in found.items() if float(v.max() - v.min()) > 1e-9}
+
+
+def _blocks(drivers: Mapping[str, Tensor]) -> Iterator[_Block]:
+    joints = [name for name in drivers if name.startswith("joint ")]
+    for name, value in drivers.items():
+        smooth = _polynomials(value, _DEGREE) if _is_many(value) else value[:, None]
+        yield _Block(name, "smooth", smooth, "channels")
+        yield _Block(name, "smooth", smooth, "joints")
+    for i, name in enumerate(joints):
+        waves = drivers[name][:, None] * torch.pi * torch.tensor(_WAVES)
+        yield _Block(
+            name, "own", torch.cat([_polynomials(drivers[name], _DEGREE), waves.sin(), waves.cos()], -1), str(i)
+        )
+    for name in (n for n in drivers if n.startswith("direction ") and n[10:].isdigit()):
+        i, value = int(name[10:]) - 1, drivers[name][:, None]
+        if i >= len(joints):
+            continue
+        own = torch.cat([torch.ones_like(value), _polynomials(drivers[joints[i]], 4)], -1)
+        yield _Block(name, "direction", value * own, str(i))
+        for other in (n for n, v in drivers.items() if n != name and _is_many(v)):
+            both = value * _polynomials(drivers[other], 2)
+            yield _Block(name + CROSS + other, "direction pair", both, str(i))
+    rows = len(next(iter(drivers.values())))
+    steps = (torch.arange(rows) >= (k * rows) // (2 * _PARTS) for k in range(1, 2 * _PARTS))
+    for step in steps:
+        yield from (_Block("time", "step", step.double()[:, None], way) for way in ("channels", "joints"))
+    for one, other in combinations(drivers, 2):
+        both = (drivers[one] * drivers[other])[:, None]
+        yield from (_Block(one + CROSS + other, "pair", both, way) for way in ("channels", "joints"))
+
+
+def _explained(
+    blocks: list[_Block], jacobian: Tensor, basis: Tensor, every: Tensor
+) -> Iterator[tuple[_Block, Tensor, int]]:
+    """Squares of what is left, and of every order drawn, that each block explains beside what was fitted, and by how
+    many directions; blocks of one shape at once.
+
+    Args:
+        blocks: `s x m` each.
+        jacobian: by the joints, whitened, `s x c x n`.
+        basis: of what was fitted, `s c x k`.
+        every: what is left, clipped and as it is, then orders of it, `s c x p`.
+    """
+    rows, channels, joints = jacobian.shape
+    eye = torch.eye(channels, dtype=torch.float64).expand(rows, -1, -1)
+    kinds: dict[tuple[int, int], list[_Block]] = {}
+    for block in blocks:
+        width = {"channels": channels, "joints": joints}.get(block.through, 1)
+        kinds.setdefault((width, block.values.shape[-1]), []).append(block)
+    for alike in kinds.values():
+        through = {"channels": eye, "joints": jacobian, **{str(i): jacobian[..., [i]] for i in range(joints)}}
+        maps = torch.stack([through[b.through] for b in alike])
+        values = torch.stack([b.values for b in alike])
+        columns = (maps[..., None] * values[:, :, None, None, :]).reshape(len(alike), rows * channels, -1)
+        columns = columns / columns.square().mean(1, keepdim=True).sqrt().clamp_min(1e-300)
+        columns = columns - basis @ (basis.mT @ columns)
+        columns = columns * (columns.square().mean(1, keepdim=True) > _OWN)
+        values_of, vectors = torch.linalg.eigh(columns.mT @ columns)
+        kept = values_of > _INDEPENDENT * values_of.amax(-1, keepdim=True).clamp_min(1e-300)
+        along = (vectors.mT @ (columns.mT @ every)).square() / values_of.clamp_min(1e-300)[..., None]
+        explained = torch.where(kept[..., None], along, 0.0).sum(1)
+        counts = torch.where(values_of.amax(-1) > 0, kept.sum(-1), 0)
+        yield from zip(alike, explained, counts.tolist(), strict=True)
+
+
+def _of_effects(analysis: Analysis, found: FittedSet) -> Iterator[Tensor]:
+    """Columns of a set's members, and what errors of their shapes change, `s x c0 x m` each."""
+    situation = analysis.situation
+    for i, mean in zip(found.members, found.mean, strict=True):
+        atom = analysis.atoms[i]
+        yield atom.columns
+        if atom.effect is None:
+            continue
+        size = scales(atom.effect.coefficients(situation), situation.joints)
+        spread = atom.spread(situation, mean) / size
+        for k in range(len(atom.shape)):
+            step = torch.zeros_like(atom.shape)
+            step[k] = _STEP * float(atom.shape[k].abs().clamp_min(1e-12))
+            more, less = (scaled_signature(situation, atom.effect, atom.shape + s * step) @ spread for s in (1, -1))
+            yield torch.nan_to_num((more - less)[..., None])
+
+
+def _whitened(analysis: Analysis, values: list[Tensor], taken: Tensor) -> list[Tensor]:
+    """Raw values `s x c0 x m` in the rows that are taken of those that count, without what rows share, `t x c x m`."""
+    keep = analysis.whitening.keep()
+    return [analysis.correlation(analysis.whitening(v)[keep])[taken] for v in values]
+
+
+def _basis(columns: Tensor) -> Tensor:
+    """Orthonormal directions of columns, `n x k`."""
+    if not columns.shape[-1]:
+        return columns
+    columns = columns / columns.square().mean(0).sqrt().clamp_min(1e-300)
+    u, s, _ = torch.linalg.svd(columns, full_matrices=False)
+    found: Tensor = u[:, s > 1e-6 * s.max().clamp_min(1e-300)]
+    return found
+
+
+def _is_many(values: Tensor) -> bool:
+    """Whether there are more than two different ones."""
+    return bool(((values != values.amin()) & (values != values.amax())).any())
+
+
+def _polynomials(value: Tensor, degree: int) -> Tensor:
+    """Chebyshev polynomials of degrees 1 to `degree` of values in [-1, 1], `s x degree`."""
+    values: Tensor = torch.from_numpy(np.polynomial.chebyshev.chebvander(value.numpy(), degree)[:, 1:])
+    return values
+
+
+def _surprise(ratio: Tensor, first: int, second: int) -> Tensor:
+    """Minus the logarithm of the probability of a larger F ratio (Paulson 1942)."""
+    a, b, root = 2 / (9 * first), 2 / (9 * second), ratio.clamp_min(0).pow(1 / 3)
+    score: Tensor = -torch.special.log_ndtr(((1 - a) - (1 - b) * root) / (a + b * root.square()).sqrt())
+    return score
+
+
+def _tail(score: float, drawn: Tensor) -> float:
+    """Probability of a larger score than this among the orders drawn, by the Gumbel distribution of their moments."""
+    width = max(float(drawn.std()), 1e-12) * 6**0.5 / np.pi
+    return float(-np.expm1(-np.exp(-(score - float(drawn.mean()) + 0.5772 * width) / width)))
