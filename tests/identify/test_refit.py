@@ -29,6 +29,7 @@ def records(path: Path, rows: int, seed: int) -> Path:
 def test_values_are_of_all_rows_and_the_judgement_of_those_left_out(tmp_path: Path) -> None:
     path = records(tmp_path / "r.csv", 60, 1)
     keys = {"mechanism": "five_bar", "records": str(path), "parameters": {"free": ["l1"]}, "save_report": False}
+    keys |= {"noise": "0.02 mm"}
     again, judged, every = (
         ccnn_torch.identify(**keys, **more)
         for more in ({}, {"refit": False}, {"split": {"test": 0.02}, "refit": False})
