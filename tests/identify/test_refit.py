@@ -30,9 +30,10 @@ def test_values_are_of_all_rows_and_the_judgement_of_those_left_out(tmp_path: Pa
     path = records(tmp_path / "r.csv", 60, 1)
     keys = {"mechanism": "five_bar", "records": str(path), "parameters": {"free": ["l1"]}, "save_report": False}
     keys |= {"noise": "0.02 mm"}
+    half = {"test": 0.5}
     again, judged, every = (
         ccnn_torch.identify(**keys, **more)
-        for more in ({}, {"refit": False}, {"split": {"test": 0.02}, "refit": False})
+        for more in ({"split": half}, {"split": half, "refit": False}, {"split": {"test": 0.02}, "refit": False})
     )
     one, other, whole = (found.results["parameters"]["l1"] for found in (again, judged, every))
     assert again.results["test"] == judged.results["test"]
