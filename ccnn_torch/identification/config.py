@@ -206,7 +206,16 @@ class IdentifyConfig(JobConfig):
         default={}, description="settings of a method, e.g. {hga: {generations: 500}}"
     )
     bootstrap: int = Field(default=0, ge=0, description="resampled fits beside the formula's intervals; 0 = none")
+    refit: bool = Field(
+        default=True,
+        description="fit again to all rows of the records when held-out rows have judged the first fit: the values and "
+        "identified.yaml are of all rows (methods lm and tikhonov; not where split.test names a file)",
+    )
     save_report: bool = Field(default=True, description="draw plots/ and write report.html")
+
+    def fits_again(self) -> bool:
+        """Whether what was judged is fitted again to all rows."""
+        return self.refit and self.records is not None and self.split.test_file is None
 
     @model_validator(mode="before")
     @classmethod

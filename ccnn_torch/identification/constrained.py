@@ -335,6 +335,12 @@ def identify_by_constraint(
     begun = time.perf_counter()
     others, told = _beside(config, mechanism)
     fit = fit_constraint(config, mechanism, rows, progress, others, [one["unit"] for one in told])
+    held = rows.weights == 0
+    before, after = (_held_error(mechanism, rows, s, held) for s in (fit.before, fit.after))
+    if config.fits_again() and bool(held.any()):
+        every = replace(rows, weights=torch.ones_like(rows.weights))
+        again = fit_constraint(config, mechanism, every, None, others, [one["unit"] for one in told])
+        fit = again if bool(again.fit.converged.all()) else fit
     outcome = Outcome(
         machines=torch.arange(1),
         values=fit.after.geometry[None],
@@ -343,7 +349,6 @@ def identify_by_constraint(
         seconds=time.perf_counter() - begun,
         message=fit.fit.message,
     )
-    held = rows.weights == 0
     notes = [*held_out_notes(config.split, int(held.sum())), *rows.notes, *notes]
     measured = Measured(
         mechanism=mechanism,
@@ -355,7 +360,6 @@ def identify_by_constraint(
         data_hash=rows.data_hash,
         notes=notes,
     )
-    before, after = (_held_error(mechanism, rows, s, held) for s in (fit.before, fit.after))
     noise = None if config.noise is None else fit.after.noise
     found = Found(outcome, _known(fit), before, after)
     results, arrays = assemble(config, measured, fit.selection, {"lm": found}, noise, _only_by_prior(fit, found.known))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from ccnn_torch.identification.identifiability import bootstrap
 from ccnn_torch.identification.judge import map_error, read_elsewhere, transferred
 from ccnn_torch.identification.measured import Measured, from_records, nominal_machine
 from ccnn_torch.identification.page import identified_page, not_settled, write_identified_csv, write_identified_report
-from ccnn_torch.identification.result import assemble, beside_truth, judged, promised, residuals_of
+from ccnn_torch.identification.result import Found, assemble, beside_truth, judged, known_at, promised, residuals_of
 from ccnn_torch.identification.simulated import count_study, simulate
 from ccnn_torch.identification.solve import (
     QUICK,
@@ -148,19 +148,34 @@ def identify(
         outcomes[method] = run_method(method, measured, config, None if watch is None else watch(method))
         if path is not None:
             save_outcome(path, outcomes[method], facts)
-    results, arrays = _judged(config, measured, outcomes)
+    judged_first = next(iter(outcomes.values())).values[0]
+    results, arrays, outcomes = _judged(config, measured, outcomes)
     results["counts"] = count_study(config, mechanism)
     if elsewhere is not None:
-        results["transfer"] = transferred(config, elsewhere, next(iter(outcomes.values())).values[0])
+        results["transfer"] = transferred(config, elsewhere, judged_first)
     return Identification(config, measured, outcomes, results, arrays, given)
+
+
+def _refitted(config: IdentifyConfig, measured: Measured, method: str, found: Found) -> Found:
+    """The same with the values that all rows give, held-out ones among them, and what is known of these."""
+    if not config.fits_again() or not measured.test.joints.shape[1] or base_method(method) not in QUICK:
+        return found
+    whole = replace(measured, rows=measured.rows.and_these(measured.test))
+    outcome = run_method(method, whole, config)
+    if not bool(outcome.converged.all()):
+        return found
+    pieces = pieces_of(whole, config, found.per_leg, outcome.machines, outcome.values)
+    return replace(found, outcome=outcome, known=known_at(pieces, select(measured, config), outcome.values))
 
 
 def _judged(
     config: IdentifyConfig, measured: Measured, outcomes: Mapping[str, Outcome]
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The content of `identified.json`, and tensors by name for the pictures."""
+) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Outcome]]:
+    """The content of `identified.json`, tensors by name for the pictures, and what is told of every method."""
     selection, first = select(measured, config), config.methods[0]
     found = {name: judged(config, measured, selection, name, outcome) for name, outcome in outcomes.items()}
+    found = {name: _refitted(config, measured, name, one) for name, one in found.items()}
+    outcomes = {name: one.outcome for name, one in found.items()}
     resampled = _bootstrap(config, measured, outcomes)
     results, arrays = assemble(config, measured, selection, found, _given_noise(config, measured), (), resampled)
     results["promise"] = promised(measured, found[first])
@@ -169,7 +184,7 @@ def _judged(
     arrays["observed"] = measured.rows.observed[:1]
     arrays |= {f"observed_leg{leg}": rows.observed[:1] for leg, rows in measured.leg_rows.items()}
     if measured.truth is None:
-        return results, arrays
+        return results, arrays, outcomes
     arrays["truth"] = measured.truth
     for name, one_found in found.items():
         block, more = beside_truth(config, measured, selection, name, one_found)
@@ -179,7 +194,7 @@ def _judged(
     error = map_error(measured, measured.start, torch.arange(measured.machines))
     if measured.map is not None and error is not None:
         arrays |= {"map": measured.map, "map_before": error}
-    return results, arrays
+    return results, arrays, outcomes
 
 
 def _given_noise(config: IdentifyConfig, measured: Measured) -> float | None:

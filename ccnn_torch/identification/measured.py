@@ -104,6 +104,10 @@ class Rows:
         """The rows of some machines."""
         return Rows(self.joints[machines], self.observed[machines])
 
+    def and_these(self, others: Rows) -> Rows:
+        """The rows with others behind them."""
+        return Rows(torch.cat([self.joints, others.joints], 1), torch.cat([self.observed, others.observed], 1))
+
     def with_more(self, columns: Tensor) -> Rows:
         """The rows with further columns `s x m` behind their joints: the number of a set-up, torques."""
         return replace(self, joints=torch.cat([self.joints, columns.to(self.joints.dtype)[None]], -1))

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,9 +71,13 @@ def test_held_out_rows_come_close_to_the_noise(folder: Path) -> None:
     assert results["noise_ratio"]["value"] == pytest.approx(1, rel=1e-3)
 
 
-def test_held_out_rows_are_judged_as_a_naive_twin_does(folder: Path) -> None:
+def test_held_out_rows_are_judged_as_a_naive_twin_does(
+    folder: Path, cli: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
     """Means of the training rows of each socket, rows drawn by numpy, from the files alone."""
-    arm = load_mechanism(str(folder / "identified.yaml"))
+    words = ("refit=false", "save_report=false", "--out", str(tmp_path / "judged"), "--quiet")
+    assert cli("identify", str(SOCKETS), *words)[0] == 0
+    arm = load_mechanism(str(tmp_path / "judged" / "identified.yaml"))
     points = tool_points(arm, joints_of(DATA)).numpy()
     table = read_table(DATA)
     cells = list(zip(table.raw("placement"), table.raw("socket"), strict=True))

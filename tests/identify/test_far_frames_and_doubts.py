@@ -128,7 +128,7 @@ def test_a_noise_that_does_not_fit_the_rows_is_doubted(tmp_path: Path) -> None:
         for noise in ("0.1 mm", "0.005 mm", "1 mm", None)
     )
     assert right == [] and unknown == []
-    assert "noise given does not fit" in small[0] and "too small" in small[0] and "17.7 times" in small[0]
+    assert "noise given does not fit" in small[0] and "too small" in small[0] and "17.8 times" in small[0]
     assert "times the noise" in small[1] and "something else is wrong" in small[1]
     assert len(large) == 1 and "too large" in large[0]
 

@@ -235,7 +235,7 @@ def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
         if negative and not bool((signed & (mean > sure)).any()):
             where = ", ".join(coefficients[k].name for k in negative)
             wrong = f"{atom.name} would have to be negative ({where}), as in no machine"
-            said.append(Caution(f"{wrong}: check the signs of the columns that it uses"))
+            said.append(Caution(f"{wrong}: check the signs of the columns that it uses", BESIDE_UNKNOWN))
     return said
 
 
