@@ -1,4 +1,4 @@
-"""Effects that depend on the column of times: latency, thermal growth, drift of joints and of the measuring frame, zeros anew."""
+"""Effects that depend on the column of times: latency, thermal growth, drift of joints and frame, zeros found anew."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ccnn_torch.effects.columns import TWIST, by_joint, of_rows, one_by_one, shown_columns
 from ccnn_torch.effects.constant import frame_columns
-from ccnn_torch.effects.loads import Member, members
 from ccnn_torch.effects.joints import JointOffset
+from ccnn_torch.effects.loads import Member, members
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
@@ -350,7 +350,7 @@ class Homing(Effect):
     description = "zeros of the joints that are found anew after each pause, as by homing"
 
     def __init__(self, begins: Tensor | None = None) -> None:
-        """begins: time of the first row of each session but the first [s]; None = those of the rows given."""
+        """begins: of each session but the first, since the first row [s]; None = those of the rows given."""
         self.begins = begins
 
     def of(self, situation: Situation) -> Homing:
@@ -377,7 +377,7 @@ class Homing(Effect):
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x (n · sessions)`."""
         begins = self._begins(situation)
-        time = situation.covariates["time"].expand(situation.joints.shape[:-1])
+        time = _passed(situation).expand(situation.joints.shape[:-1])
         number = torch.bucketize(time.contiguous(), begins, right=True)
         inside = torch.nn.functional.one_hot(number, len(begins) + 1).to(situation.joints.dtype)
         return by_joint(inside.unsqueeze(-2).expand(*situation.joints.shape, -1))
@@ -385,10 +385,11 @@ class Homing(Effect):
     def _begins(self, situation: Situation) -> Tensor:
         if self.begins is not None:
             return self.begins
-        time = situation.covariates["time"].flatten().unique()
+        time = torch.unique(_passed(situation))
         steps = time.diff()
         usual = float(steps.median()) if len(steps) else 0.0
-        return time[1:][steps > max(_USUAL_STEPS * usual, _PAUSE)]
+        begins: Tensor = time[1:][steps > max(_USUAL_STEPS * usual, _PAUSE)]
+        return begins
 
 
 ROW = "row"
