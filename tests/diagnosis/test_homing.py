@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -77,3 +80,16 @@ def test_geometry_is_fitted_beside_it_and_the_machine_has_no_zero_of_a_day() -> 
     assert machine is not None and not machine["effects"]
     assert machine["parameters"]["x2"] == pytest.approx(LENGTHS[0] + 8e-4, abs=1e-5)
     assert named_machine(diagnose_rows(*measured(0, "homing"))) is None
+
+
+def test_simulated_days_are_told_and_no_line_promises_to_correct_tomorrow(
+    cli: Callable[..., tuple[int, str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = ("--effect", "homing", "--rows", "60", "--noise", "1e-5", "--out", "r.csv", "--quiet")
+    assert cli("simulate", "--mechanism", "five_bar", *made)[0] == 0
+    asked = ("--noise", "1e-5", "--no-network", "--out", "d")
+    code, shown, _ = cli("diagnose", "--records", "r.csv", "--mechanism", "five_bar", *asked)
+    assert code == 0 and "New zero by session of joints 1 and 2" in shown
+    assert "commands are not corrected for it" in " ".join(shown.split())
+    assert "Compensate:" not in shown and "ccnn compensate" not in shown
