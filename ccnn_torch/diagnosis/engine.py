@@ -36,6 +36,7 @@ from ccnn_torch.effects import (
     owned,
     pose_residual,
 )
+from ccnn_torch.effects.time import Homing
 from ccnn_torch.errors import InputError, RowsError
 
 OUTLIER = "outlier"
@@ -64,7 +65,10 @@ def candidates(
     if every and all(lacking.values()):
         need = "; ".join(f"{name} needs {why}" for name, why in lacking.items())
         raise InputError(f"effects: these records can show none of the candidates: {need}")
-    return [e for e in every if not lacking[e.name]], {n: why for n, why in lacking.items() if why}
+    usable = (e for e in every if not lacking[e.name])
+    return [e.of(situation) if isinstance(e, Homing) else e for e in usable], {
+        n: why for n, why in lacking.items() if why
+    }
 
 
 def _made(situation: Situation, effects: Sequence[Effect | str] | None) -> list[Effect]:

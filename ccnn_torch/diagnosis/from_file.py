@@ -99,7 +99,7 @@ class Verdict:
                     f"the covariates of this run; give the mechanism and covariates that were diagnosed"
                     + (f" ({', '.join(self.covariates)})" if self.covariates else "")
                 )
-            known = _known(effect, alone, values)
+            known = with_numbers(effect, alone, values)
             left = [n for n in values if n not in _named([*effect.coefficients(alone), *effect.shapes(alone)])]
             if left:
                 notes.append(
@@ -123,11 +123,6 @@ def in_time(situation: Situation, time: Tensor) -> Situation:
         time: since the first row [s], or the numbers of the rows, `s`.
     """
     return replace(situation, covariates={**situation.covariates, ROW: time})
-
-
-def frame_drift(situation: Situation, values: Mapping[str, float]) -> Known:
-    """A drift of the measuring frame with numbers by name [SI]; situation: as `in_time` gives it."""
-    return _known(FrameDrift(), situation, values)
 
 
 def one_row_at_a_time(situation: Situation) -> Situation:
@@ -241,7 +236,8 @@ def _held(name: str) -> bool:
     return name in EFFECTS
 
 
-def _known(effect: Effect, situation: Situation, values: Mapping[str, float]) -> Known:
+def with_numbers(effect: Effect, situation: Situation, values: Mapping[str, float]) -> Known:
+    """An effect with numbers by name [SI]; situation: rows as `one_row_at_a_time` or `in_time` gives them."""
     coefficients, shapes = effect.coefficients(situation), effect.shapes(situation)
     middles = [s.grid[len(s.grid) // 2] for s in shapes]
     return Known(

@@ -17,10 +17,10 @@ from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.from_file import (
     TRAINING_ROWS,
     Verdict,
-    frame_drift,
     in_time,
     one_row_at_a_time,
     usable_verdict,
+    with_numbers,
 )
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.diagnosis.mount import SET_ANEW, frames_taken, mount_notes
@@ -33,7 +33,7 @@ from ccnn_torch.effects.by_group import ByGroup
 from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.effects.found_machine import found_block
-from ccnn_torch.effects.time import ROW, FrameDrift, elapsed
+from ccnn_torch.effects.time import ROW, FrameDrift, Homing, elapsed
 from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import (
     BlackBox,
@@ -276,6 +276,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
     named = tuple((a.effect.name, _numbers(a, said)) for a in said.acting)
     try:
         whole, drift = Verdict(TRAINING_ROWS, here.gravity, named).of_machine()
+        beside = [(a.effect, numbers) for a, (_, numbers) in zip(said.acting, named, strict=True) if _is_beside(a)]
         verdict = usable_verdict(whole, recorded)[0]
         if verdict is None and drift is None:
             return None
@@ -284,15 +285,15 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         if identify and isinstance(arm, SerialArm):
             situation = _in_link_frames(situation)
         known = [] if verdict is None else [k for k in verdict.on(recorded)[0] if k.effect.kind != "parameters"]
-        if drift is not None:
+        if beside:
             # Fitted beside, and left out: it is none of the machine.
             times = (here.covariates[n] for n in ("time", ROW) if n in here.covariates)
             situation = in_time(situation, elapsed(next(times)))
-            known.append(frame_drift(situation, drift))
+            known += [with_numbers(effect, situation, numbers) for effect, numbers in beside]
         loose = loose_parameters(situation.mechanism, identify)
         fine = analysis.whitening.counted & ~analysis.near_singular
         acting, values = fit_jointly(situation, analysis.measured, known, fine, loose)
-        acting = [a for a in acting if a.effect.name != FrameDrift.name]
+        acting = [a for a in acting if not _is_beside(a)]
         if grouped:
             situation, values = _in_own_base(situation, values[0])
         used = used_covariates(situation, acting)
@@ -304,6 +305,11 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
     except InputError:
         # A machine that no file describes, or an effect that needs what was before a row.
         return None
+
+
+def _is_beside(acting: Acting) -> bool:
+    """Whether an effect is of these rows alone, and not of the machine that others meet."""
+    return acting.effect.name in (FrameDrift.name, Homing.name)
 
 
 def _in_link_frames(situation: Situation) -> Situation:

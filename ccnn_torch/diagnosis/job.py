@@ -22,6 +22,7 @@ from ccnn_torch.diagnosis.progress import TO_REPORT, TO_VERDICT, watched
 from ccnn_torch.diagnosis.result import Said
 from ccnn_torch.display import short_path
 from ccnn_torch.effects import OUTLIER
+from ccnn_torch.effects.time import Homing
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.mechanisms import Mechanism, load_mechanism, simulated_rows
@@ -160,7 +161,9 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
         path: the diagnosis.json that was written.
     """
     verdict, covariates = diagnosis.verdict, config.covariates
-    if verdict["none"] or verdict["effects"] == [OUTLIER]:
+    # The next session has another zero, which no model of these rows knows.
+    vain = verdict["effects"] in ([OUTLIER], [Homing.name]) and not verdict["outside_library"]
+    if verdict["none"] or vain:
         return ()
     keys = {"records": _records(config), "mechanism": typed_path(str(config.mechanism))}
     for key, value in (

@@ -21,7 +21,7 @@ from ccnn_torch.effects.loads import Compliance, Gravity, Sag
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.effects.sky import Flexure
-from ccnn_torch.effects.time import Drift, FrameDrift, Latency, Thermal
+from ccnn_torch.effects.time import Drift, FrameDrift, Homing, Latency, Thermal
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, sees_directions
 from ccnn_torch.numerics.batching import leading_shape
@@ -226,7 +226,8 @@ def missing_on(effect: Effect, situation: Situation) -> str:
     if isinstance(effect, OwnEffect):
         for breach in _breaches(effect, situation):
             raise InputError(f"{effect.label}: {breach}")
-    return effect.missing(situation.mechanism, [*situation.covariates])
+    lacking = effect.missing(situation.mechanism, [*situation.covariates])
+    return effect.without_pauses(situation) if isinstance(effect, Homing) and not lacking else lacking
 
 
 def check_names(effects: Sequence[Effect]) -> None:
@@ -343,6 +344,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "gravity": Gravity,
     "thermal": Thermal,
     "drift": Drift,
+    "homing": Homing,
     "frame": Frame,
     "tool": Tool,
     "coupling": Coupling,
@@ -354,7 +356,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
 """Name -> maker. The order is that of listings, and of what a verdict names where several do the very same: causes in
 the machine first, the measuring device last."""
 
-EXACT = frozenset({"geometry", "joint_offset", "joint_gain", "frame", "tool", "instrument"})
+EXACT = frozenset({"geometry", "joint_offset", "joint_gain", "homing", "frame", "tool", "instrument"})
 """Effects whose form is kinematics: what they leave is something else, where friction, growth or a belt that couples
 two joints may just be of another form than the textbook's."""
 

@@ -1,15 +1,17 @@
-"""Effects that depend on the column of times: latency, thermal growth, drift of joints and of the measuring frame."""
+"""Effects that depend on the column of times: latency, thermal growth, drift of joints and frame, zeros found anew."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.effects.columns import TWIST, by_joint, of_rows, one_by_one, shown_columns
 from ccnn_torch.effects.constant import frame_columns
+from ccnn_torch.effects.joints import JointOffset
 from ccnn_torch.effects.loads import Member, members
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import Situation
@@ -334,6 +336,60 @@ def _duration(situation: Situation) -> float:
 
 def _slowing(situation: Situation) -> tuple[int, ...]:
     return tuple((2 + _WALK) * i + 1 for i in range(len(situation.mechanism.joints)))
+
+
+# A pause is so many times as long as the usual step, and no shorter [s]; a session has so many rows or more.
+_USUAL_STEPS, _PAUSE, _SESSION_ROWS = 20, 300.0, 6
+
+
+class Homing(Effect):
+    """Δq_i = c_is in session s: homed, or an encoder's zero found, anew after each pause between the rows."""
+
+    name = "homing"
+    kind = "joints"
+    description = "zeros of the joints that are found anew after each pause, as by homing"
+
+    def __init__(self, begins: Tensor | None = None) -> None:
+        """begins: of each session but the first, since the first row [s]; None = those of the rows given."""
+        self.begins = begins
+
+    def of(self, situation: Situation) -> Homing:
+        """The same with the sessions of these rows, also on others."""
+        return Homing(self._begins(situation))
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Time; whether that has pauses, `without_pauses` tells."""
+        return "" if "time" in covariates else "the time of each row, with pauses: time[s]"
+
+    def without_pauses(self, situation: Situation) -> str:
+        """What is missing in the times themselves, as in `missing`."""
+        most = situation.joints.shape[-2] // _SESSION_ROWS
+        if 1 <= len(self._begins(situation)) <= most:
+            return ""
+        return f"pauses in time[s], at least one and {most} at most, each of five minutes and 20 usual steps or longer"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """One a joint and session."""
+        sessions = range(1, len(self._begins(situation)) + 2)
+        zeros = JointOffset().coefficients(situation)
+        return tuple(replace(zero, name=f"{zero.name} session {k}") for zero in zeros for k in sessions)
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x (n · sessions)`."""
+        begins = self._begins(situation)
+        time = _passed(situation).expand(situation.joints.shape[:-1])
+        number = torch.bucketize(time.contiguous(), begins, right=True)
+        inside = torch.nn.functional.one_hot(number, len(begins) + 1).to(situation.joints.dtype)
+        return by_joint(inside.unsqueeze(-2).expand(*situation.joints.shape, -1))
+
+    def _begins(self, situation: Situation) -> Tensor:
+        if self.begins is not None:
+            return self.begins
+        time = torch.unique(_passed(situation))
+        steps = time.diff()
+        usual = float(steps.median()) if len(steps) else 0.0
+        begins: Tensor = time[1:][steps > max(_USUAL_STEPS * usual, _PAUSE)]
+        return begins
 
 
 ROW = "row"

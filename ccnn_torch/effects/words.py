@@ -98,6 +98,13 @@ _WORDS = {
         "",
         "Clamping of base, part and measuring device, and the warm-up of {where}.",
     ),
+    "homing": Words(
+        "a new zero of the joints after each pause",
+        "new zero by session",
+        "The zero of each session between two pauses. The next one has another: commands are not corrected for it.",
+        "Homing of {where}: reference switch, index pulse or battery of the encoder. Home again, or measure the zero "
+        "at each start.",
+    ),
     "frame_drift": Words(
         "a measuring frame that moves in time",
         "drift of the measuring frame",

@@ -15,6 +15,7 @@ from ccnn_torch.config.sizes import Noise, noise_of_pose
 from ccnn_torch.effects import OUTLIER, Acting, Situation, default_gravity, measured_pose, reached
 from ccnn_torch.effects.covariates import covariate_units, directions, draw_covariates, rest_torques
 from ccnn_torch.effects.loads import Sag
+from ccnn_torch.effects.time import Homing
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import make_folder
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism, sees_directions
@@ -26,6 +27,8 @@ from ccnn_torch.simulation.config import SimulateConfig
 
 # Between two moves; rows so far apart are not taken for one trajectory [s].
 _PAUSE = 2.0
+# Days that homing tells apart, and what is between two of them [s].
+_DAYS, _NIGHT = 4, 16 * 3600.0
 # For velocities, as a share of a move.
 _INSTANT = 1e-4
 _DRAWS = 50
@@ -198,6 +201,8 @@ def simulate_records(
     generator = torch.Generator().manual_seed(seed)
     moving = config.rows == "trajectory" or (config.rows == "auto" and any(w.name == "latency" for w in wanted))
     joints, columns = (draw_moves if moving else draw_poses)(machine, rows, config, generator)
+    if any(w.name == Homing.name for w in wanted):
+        columns["time"] = columns["time"] + _NIGHT * (torch.arange(rows) * _DAYS // rows)
     down = default_gravity(machine) if config.gravity is None else torch.tensor(config.gravity, dtype=torch.float64)
     torques = any(w.name == Sag.name for w in wanted)
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, owned, reached, signature
-from ccnn_torch.effects.covariates import draw_covariates, rest_torques
+from ccnn_torch.effects.covariates import SHIFT, draw_covariates, rest_torques
 from ccnn_torch.effects.registry import OwnEffect, label_of, missing_on
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
@@ -77,6 +77,8 @@ def _situation(machine: Mechanism, seed: int) -> Situation:
     if len(joints) < _ROWS:
         raise AssertionError(f"mechanism '{machine.name}': nearly all its sampled configurations are singular")
     columns = draw_covariates(machine, joints, generator)
+    # A night in the middle of them.
+    columns["time"] = columns["time"] + SHIFT * (torch.arange(_ROWS) >= _ROWS // 2)
     speeds = torch.randn(joints.shape, generator=generator, dtype=torch.float64)
     columns |= {f"speed{i + 1}": 0.1 * speeds[:, i] for i in range(len(machine.joints))}
     rows = Situation(machine, joints, columns, default_gravity(machine))

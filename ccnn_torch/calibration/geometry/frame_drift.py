@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.from_file import Verdict, frame_drift, in_time
+from ccnn_torch.diagnosis.from_file import Verdict, in_time, with_numbers
 from ccnn_torch.diagnosis.from_records import situation_of
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.effects import without_pose_effects
@@ -37,7 +37,7 @@ def without_frame_drift(
         return records, verdict, []
     recorded = situation_of(records, mechanism)
     situation = in_time(on_fitted_frames(recorded), moments(records))
-    known = [*others.on(recorded, identify)[0], frame_drift(situation, drift)]
+    known = [*others.on(recorded, identify)[0], with_numbers(FrameDrift(), situation, drift)]
     fine = torch.zeros(len(records), dtype=torch.bool)
     fine[rows] = True
     fine &= torch.isfinite(situation.pose).all(-1)

@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis.candidates.atom import default_shape, scaled_signature
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
-from ccnn_torch.effects import Effect, Situation, pose_residual
+from ccnn_torch.effects import Effect, Situation, missing_on, pose_residual
 from ccnn_torch.effects.backlash import Backlash
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
 from ccnn_torch.effects.time import ROW, FrameDrift
@@ -61,7 +61,7 @@ def missing_covariates(
         size = 0.0
         # A user's own effect that fails on columns that were not recorded must not cost the verdict.
         with suppress(InputError):
-            size = 0.0 if added is None else _plausible(there, effect, position)
+            size = 0.0 if added is None or missing_on(effect, there) else _plausible(there, effect, position)
         if added is not None and size > 0:
             found.setdefault(added, {})[effect.name] = size
     for condition in mechanism.lacking(names):

@@ -102,10 +102,16 @@ def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
     """
     rows, channels = analysis.dictionary.y.shape
     order = torch.Generator().manual_seed(0)
-    taken = torch.randperm(rows, generator=order)[: max(_MOST // channels, 1)].sort().values
+    seen, keep = analysis.whitening.seen, analysis.whitening.keep()
+    # Rows in which a part was not measured are none to exchange.
+    whole = torch.arange(rows) if seen is None else torch.nonzero(seen[keep].all(-1))[:, 0]
+    drawn_rows = torch.randperm(len(whole), generator=order)[: max(_MOST // channels, 1)]
+    taken = whole[drawn_rows].sort().values
     own = [analysis.fitted, *_of_effects(analysis, found), analysis.situation.jacobian]
     target, *columns, jacobian = _whitened(analysis, [analysis.residual[..., None], *own], taken)
     rows = len(taken)
+    if rows < 2:
+        return None
     scale = torch.ones(channels, dtype=torch.float64)
     for _ in range(_SCALINGS):
         basis = _basis(torch.cat([c * scale[:, None] for c in columns], -1).flatten(0, 1))
@@ -122,7 +128,7 @@ def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
     every = torch.stack([by_row.flatten(), left, *drawn], -1)
     total = every.square().sum(0) - (basis.mT @ every).square().sum(0)
     jacobian = jacobian * used[:, None]
-    blocks = [*_blocks(_drivers(analysis, analysis.whitening.keep()[taken]))]
+    blocks = [*_blocks(_drivers(analysis, keep[taken]))]
     best: dict[str, Tensor] = {}
     strongest = -torch.inf, "", 0.0
     for block, explained, count in _explained(blocks, jacobian, basis, every):

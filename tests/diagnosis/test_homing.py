@@ -1,0 +1,95 @@
+"""Zeros that are found anew after each pause: made-up planar arms with kinematics of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from ccnn_torch.diagnosis.engine import diagnose_rows
+from ccnn_torch.diagnosis.from_records import named_machine
+from ccnn_torch.effects import Situation, default_gravity, make_effect, missing_on
+from ccnn_torch.mechanisms import SerialArm
+
+Array = NDArray[np.float64]
+LENGTHS = (0.3, 0.25)
+ARM = SerialArm(
+    "arm", "standard", [[a, 0.0, 0.0, 0.0] for a in LENGTHS], tool_offset=[0.0, 0.0, 0.0], orientation="none"
+)
+
+
+def reached(joints: Array, longer: float = 0.0) -> Array:
+    first, both = joints[:, 0], joints.sum(1)
+    inner, outer = LENGTHS[0] + longer, LENGTHS[1]
+    x = inner * np.cos(first) + outer * np.cos(both)
+    return np.stack([x, inner * np.sin(first) + outer * np.sin(both), 0 * x], 1)
+
+
+def measured(seed: int, wrong: str, days: int = 4, rows: int = 80) -> tuple[Situation, torch.Tensor]:
+    """Rows of some days of an arm on which something is wrong, and the poses measured."""
+    draw = np.random.default_rng(seed)
+    joints = np.stack([draw.uniform(-2, 2, rows), draw.uniform(0.5, 2.2, rows)], 1)
+    day = np.arange(rows) * days // rows
+    time = np.cumsum(draw.uniform(20, 70, rows)) + day * 86400.0 * draw.uniform(0.8, 1.2)
+    temperature = 293.15 + 2 * np.sin(2 * np.pi * time / 86400) + draw.normal(0, 0.05, rows)
+    sizes = draw.choice([-1, 1], 2) * draw.uniform(2e-4, 5e-4, 2)
+    off = {
+        "homing": draw.normal(0, 2e-4, (days, 2))[day],
+        "drift": np.outer(time / time[-1], sizes),
+        "joint_offset": np.tile(sizes, (rows, 1)),
+    }
+    poses = reached(joints + off.get(wrong.partition(" ")[0], 0.0), 8e-4 * wrong.endswith("geometry"))
+    poses += draw.normal(0, 1e-5, poses.shape)
+    covariates = {"time": torch.tensor(time), "temperature": torch.tensor(temperature)}
+    return Situation(ARM, torch.tensor(joints), covariates, default_gravity(ARM)), torch.tensor(poses)
+
+
+def test_a_new_zero_each_day_is_named_alone() -> None:
+    said = [diagnose_rows(*measured(seed, "homing")).verdict for seed in range(5)]
+    assert sum(one["effects"] == ["homing"] and not one["outside_library"] for one in said) >= 4, said
+    assert all("drift" not in one["effects"] for one in said)
+    assert max(one["probability"] for one in said) > 0.85 and min(one["shrink"] for one in said) > 0.98
+
+
+@pytest.mark.parametrize("wrong", ["", "drift", "joint_offset"])
+def test_pauses_alone_are_no_new_zeros(wrong: str) -> None:
+    for seed in range(10):
+        said = diagnose_rows(*measured(seed, wrong)).verdict
+        assert said["effects"] == ([wrong] if wrong else []), (seed, said)
+
+
+def test_it_needs_pauses_and_few_of_them() -> None:
+    homing = make_effect("homing")
+    assert "time[s]" in homing.missing(ARM, [])
+    assert not missing_on(homing, measured(0, "")[0])
+    for days in (1, 20):
+        assert "at least one and 13 at most" in missing_on(homing, measured(0, "", days)[0])
+    without = diagnose_rows(*measured(0, "drift", days=1))
+    assert "pauses in time[s]" in without.not_seen["homing"]
+    assert not any("homing" in entry["effects"] for entry in without.content["missing_covariates"])
+
+
+def test_geometry_is_fitted_beside_it_and_the_machine_has_no_zero_of_a_day() -> None:
+    said = diagnose_rows(*measured(2, "homing geometry"))
+    assert set(said.verdict["effects"]) == {"homing", "geometry"}
+    machine = named_machine(said)
+    assert machine is not None and not machine["effects"]
+    assert machine["parameters"]["x2"] == pytest.approx(LENGTHS[0] + 8e-4, abs=1e-5)
+    assert named_machine(diagnose_rows(*measured(0, "homing"))) is None
+
+
+def test_simulated_days_are_told_and_no_line_promises_to_correct_tomorrow(
+    cli: Callable[..., tuple[int, str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = ("--effect", "homing", "--rows", "60", "--noise", "1e-5", "--out", "r.csv", "--quiet")
+    assert cli("simulate", "--mechanism", "five_bar", *made)[0] == 0
+    asked = ("--noise", "1e-5", "--no-network", "--out", "d")
+    code, shown, _ = cli("diagnose", "--records", "r.csv", "--mechanism", "five_bar", *asked)
+    assert code == 0 and "New zero by session of joints 1 and 2" in shown
+    assert "commands are not corrected for it" in " ".join(shown.split())
+    assert "Compensate:" not in shown and "ccnn compensate" not in shown
