@@ -73,7 +73,7 @@ def test_heights_beside_few_positions(tmp_path: Path) -> None:
         assert "x, y are missing in 60 of 72 rows, which count with what was measured" in mixed.results["notes"]
         better.append(left(machine, mixed, truth) / left(machine, whole, truth))
         ratios.append(errors_in_sd(mixed, truth))
-    assert np.exp(np.mean(np.log(better))) < 0.8, better
+    assert max(better) < 1 and np.exp(np.mean(np.log(better))) < 0.92, better
     every = torch.cat(ratios)
     assert len(every) >= 12 and 0.4 < float(every.square().mean().sqrt()) < 1.7, every
 
@@ -146,7 +146,7 @@ def test_a_tracker_that_lost_the_orientation(tmp_path: Path, monkeypatch: pytest
         joints = machine.sample_joints(200, torch.Generator().manual_seed(9))
         there, real = found.forward_kinematics(joints), machine.forward_kinematics(joints, truth)
         left_by[name] = float((there - real)[:, :3].square().sum(-1).mean().sqrt())
-    assert left_by["mixed"] < 0.8 * left_by["whole"] and left_by["mixed"] < 3e-5, left_by
+    assert left_by["mixed"] < 0.9 * left_by["whole"] and left_by["mixed"] < 3e-5, left_by
     code, out, err = cli("verify", "mixed/identified.yaml", "new.csv", "--out", "verified")
     # One of rx, ry, rz alone is no orientation.
     assert code == 0 and "rx, ry, rz are missing in 10 of 40 rows" in out, (out, err)
