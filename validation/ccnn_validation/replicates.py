@@ -2,8 +2,8 @@
 
 `CCNN_MEASURED=DIR python -m ccnn_validation.replicates [--only WORD] [--out CSV]`. No truth is needed. Halves are drawn
 in blocks of ten rows, so that readings of one target stay together and the order holds; days, nights and placements are
-as measured. Without `CCNN_MEASURED`, the folder that holds `ur10_a/records.csv` and the like, only robots whose rows
-are in the repository are judged.
+as measured, each beside the next. Without `CCNN_MEASURED`, the folder that holds `ur10_a/records.csv` and the like,
+only robots whose rows are in the repository are judged.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import csv
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -206,7 +206,9 @@ def squares(said: Diagnosis, repair: Repair) -> Tensor:
     """Squared position errors [m²] of a repaired model in the rows that a diagnosis counted, unknown frames fitted."""
     here, measured, white = said.analysis.situation, said.analysis.measured, said.analysis.whitening
     unknown = getattr(here.mechanism, "unknown_frames", ())
+    # One replicate is one group of rows, whose frames are the same in all of them.
     values = here.mechanism.resolve(here.parameters)
+    values = values if values.dim() == 1 else values[0]
     if repair.nominal is not None and repair.values is not None:
         frames = dict(zip((g.name for g in here.mechanism.geometry), values.unbind(-1), strict=True))
         here = replace(here, mechanism=repair.nominal, parameters=None)
@@ -317,7 +319,7 @@ def summary(pairs: Sequence[Pair]) -> dict[str, Block]:
     # Nothing is crossed where nothing is named.
     named = [p.left for p in pairs if p.left["bare"] == p.left["bare"] and any({*n} - {"outside"} for n in p.names)]
     return {
-        "pairs with the same names": share(p.same for p in pairs),
+        "pairs with the same names": share(p.same for p in pairs if "refused" not in p.names[0] + p.names[1]),
         "numbers within the joint 95 % interval": share(numbers),
         "numbers of the same period": share([True] * len(numbers) + [False] * other),
         "numbers told, better than none in the other's rows": share(x["told crossed"] < x["bare"] for x in named),
@@ -340,7 +342,7 @@ def main() -> None:
             continue
         machine = make()
         said = {label: diagnosed(lines, machine.mechanism) for label, lines in machine.replicates.items()}
-        for labels in combinations(said, 2):
+        for labels in pairwise(said):
             pairs.append(compared(said[labels[0]], said[labels[1]], machine.apart))
             rows.append(row(name, labels, pairs[-1]))
             print("\n  ".join([rows[-1][0], *map(": ".join, zip(HEADER[1:], rows[-1][1:], strict=True))]), flush=True)
