@@ -299,7 +299,7 @@ def row(machine: str, labels: Sequence[str], pair: Pair) -> tuple[str, ...]:
     said = [" + ".join(sorted(names)) or "nothing" for names in pair.names]
     beside = [(pair.other_shape, "other period"), (pair.alone, "told by one")]
     more = "".join(f", {count} {what}" for count, what in beside if count)
-    left = {way: "–" if value != value else f"{1e6 * value:.3g}" for way, value in pair.left.items()}
+    left = {way: "–" if value != value else f"{float(f'{1e6 * value:.3g}'):g}" for way, value in pair.left.items()}
     return (
         f"{machine}, {' / '.join(labels)}",
         said[0] if said[0] == said[1] else " / ".join(said),
