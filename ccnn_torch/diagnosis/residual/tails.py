@@ -12,7 +12,7 @@ _DEGREES, _UNUSUAL = (3.0, 5.0, 10.0), 3.0
 # Steps of expectation and maximisation.
 _STEPS = 20
 # Squared scale of a channel, at least: where its noise is at the least that is believed, it may be far smaller.
-_LEAST = 0.25
+_LEAST = 0.1
 
 
 def weights_of(left: Tensor, seen: Tensor, is_known: bool) -> Tensor:
