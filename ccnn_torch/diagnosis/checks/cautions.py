@@ -179,7 +179,8 @@ def _of_noise(analysis: Analysis, judgement: Judgement) -> list[Caution]:
         quiet = f"the rows scatter by {number_text(left, 2)} times the noise that was given"
         return [Caution(f"{quiet}: with less of it smaller causes would show")]
     times = times_the_noise(analysis, min(analysis.found, key=lambda f: f.rss))
-    if times <= 1:
+    # Of a noise that the records show an outside cause says as much.
+    if times <= 1 or (judgement.outside and not analysis.whitening.known):
         return []
     loud = f"whatever is tried leaves {number_text(times, 2)} times the noise {known}"
     return [Caution(f"{loud}: it is too small, or something is there that follows nothing recorded")]
