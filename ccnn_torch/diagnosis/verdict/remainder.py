@@ -93,6 +93,24 @@ def times_the_noise(analysis: Analysis, found: FittedSet) -> float:
     return float((found.rss / free / max(analysis.floor, 1e-300)) ** 0.5)
 
 
+class _Left(NamedTuple):
+    """What is left in units of a robust noise.
+
+    Attributes:
+        basis: orthonormal directions of what was fitted, `s c x k`.
+        target: what was to be explained, `s c`.
+        every: what is left, clipped and as it is, then orders of its rows, `s c x p`.
+        frames: what fitted frames do, `s c x r`.
+        jacobian: by the joints, `s x c x n`.
+    """
+
+    basis: Tensor
+    target: Tensor
+    every: Tensor
+    frames: Tensor
+    jacobian: Tensor
+
+
 def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
     """Test what a set leaves of the rows that count; None where they are too few.
 
@@ -100,18 +118,43 @@ def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
         analysis: of the rows.
         found: the set.
     """
-    rows, channels = analysis.dictionary.y.shape
-    order = torch.Generator().manual_seed(0)
+    channels, order = analysis.dictionary.y.shape[1], torch.Generator().manual_seed(0)
     seen, keep = analysis.whitening.seen, analysis.whitening.keep()
     # Rows in which a part was not measured are none to exchange.
-    whole = torch.arange(rows) if seen is None else torch.nonzero(seen[keep].all(-1))[:, 0]
-    drawn_rows = torch.randperm(len(whole), generator=order)[: max(_MOST // channels, 1)]
-    taken = whole[drawn_rows].sort().values
+    whole = torch.arange(len(keep)) if seen is None else torch.nonzero(seen[keep].all(-1))[:, 0]
+    taken = whole[torch.randperm(len(whole), generator=order)[: max(_MOST // channels, 1)].sort().values]
+    rest = _left(analysis, found, taken, order) if len(taken) > 1 else None
+    if rest is None:
+        return None
+    free = len(rest.basis) - rest.basis.shape[1]
+    total = rest.every.square().sum(0) - (rest.basis.mT @ rest.every).square().sum(0)
+    best: dict[str, Tensor] = {}
+    strongest = -torch.inf, "", 0.0
+    for block, explained, count in _explained([*_blocks(_drivers(analysis, keep[taken]))], rest):
+        if not count or free - count < _FEWEST:
+            continue
+        ratio = (explained / count) / ((total - explained).clamp_min(1e-300) / (free - count))
+        score = _surprise(ratio, count, free - count)
+        best[block.family] = torch.maximum(score, best.get(block.family, score))
+        # Of many drivers that go together the one that needs least for it (Schwarz 1978).
+        evidence = float(free * (total / (total - explained))[0].log() - count * math.log(free)) / 2
+        extra = float(explained[1] - count * (total[1] - explained[1]) / (free - count))
+        strongest = max(strongest, (evidence, block.driver, extra))
+    if not best:
+        return None
+    smallest = min(_tail(float(score[0]), score[2:]) for score in best.values())
+    _, driver, extra = strongest
+    frames = _basis(rest.frames)
+    gap = float(rest.target.square().sum() - (frames.mT @ rest.target).square().sum()) - len(rest.target)
+    parts = dict.fromkeys(PLACE if part.startswith(PLACE) else part for part in driver.split(CROSS))
+    return Remainder(min(1.0, len(best) * smallest), CROSS.join(parts), extra / max(gap, 1.0))
+
+
+def _left(analysis: Analysis, found: FittedSet, taken: Tensor, order: torch.Generator) -> _Left | None:
+    """What a set leaves of the rows taken, `t`; None where nearly all was fitted. order: of the rows, is drawn from."""
     own = [analysis.fitted, *_of_effects(analysis, found), analysis.situation.jacobian]
     target, *columns, jacobian = _whitened(analysis, [analysis.residual[..., None], *own], taken)
-    rows = len(taken)
-    if rows < 2:
-        return None
+    rows, channels = target.shape[:2]
     scale = torch.ones(channels, dtype=torch.float64)
     for _ in range(_SCALINGS):
         basis = _basis(torch.cat([c * scale[:, None] for c in columns], -1).flatten(0, 1))
@@ -126,29 +169,7 @@ def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
     by_row = (clipped - basis @ (basis.mT @ clipped)).reshape(rows, channels)
     drawn = [by_row[torch.randperm(rows, generator=order)].flatten() for _ in range(_ORDERS)]
     every = torch.stack([by_row.flatten(), left, *drawn], -1)
-    total = every.square().sum(0) - (basis.mT @ every).square().sum(0)
-    jacobian = jacobian * used[:, None]
-    blocks = [*_blocks(_drivers(analysis, keep[taken]))]
-    best: dict[str, Tensor] = {}
-    strongest = -torch.inf, "", 0.0
-    for block, explained, count in _explained(blocks, jacobian, basis, every):
-        if not count or free - count < _FEWEST:
-            continue
-        ratio = (explained / count) / ((total - explained).clamp_min(1e-300) / (free - count))
-        score = _surprise(ratio, count, free - count)
-        best[block.family] = torch.maximum(score, best.get(block.family, score))
-        # Of many drivers that go together the one that needs least for it (Schwarz 1978).
-        evidence = float(free * (total / (total - explained))[0].log() - count * math.log(free)) / 2
-        extra = float(explained[1] - count * (total[1] - explained[1]) / (free - count))
-        strongest = max(strongest, (evidence, block.driver, extra))
-    if not best:
-        return None
-    smallest = min(_tail(float(score[0]), score[2:]) for score in best.values())
-    _, driver, extra = strongest
-    frames = _basis((columns[0] * used[:, None]).flatten(0, 1))
-    gap = float(y.square().sum() - (frames.mT @ y).square().sum()) - rows * channels
-    parts = dict.fromkeys(PLACE if part.startswith(PLACE) else part for part in driver.split(CROSS))
-    return Remainder(min(1.0, len(best) * smallest), CROSS.join(parts), extra / max(gap, 1.0))
+    return _Left(basis, y, every, (columns[0] * used[:, None]).flatten(0, 1), jacobian * used[:, None])
 
 
 def _drivers(analysis: Analysis, keep: Tensor) -> Mapping[str, Tensor]:
@@ -195,18 +216,10 @@ def _blocks(drivers: Mapping[str, Tensor]) -> Iterator[_Block]:
         yield from (_Block(one + CROSS + other, "pair", both, way) for way in ("channels", "joints"))
 
 
-def _explained(
-    blocks: list[_Block], jacobian: Tensor, basis: Tensor, every: Tensor
-) -> Iterator[tuple[_Block, Tensor, int]]:
+def _explained(blocks: list[_Block], rest: _Left) -> Iterator[tuple[_Block, Tensor, int]]:
     """Squares of what is left, and of every order drawn, that each block explains beside what was fitted, and by how
-    many directions; blocks of one shape at once.
-
-    Args:
-        blocks: `s x m` each.
-        jacobian: by the joints, whitened, `s x c x n`.
-        basis: of what was fitted, `s c x k`.
-        every: what is left, clipped and as it is, then orders of it, `s c x p`.
-    """
+    many directions; blocks of one shape at once."""
+    basis, jacobian = rest.basis, rest.jacobian
     rows, channels, joints = jacobian.shape
     eye = torch.eye(channels, dtype=torch.float64).expand(rows, -1, -1)
     kinds: dict[tuple[int, int], list[_Block]] = {}
@@ -223,7 +236,7 @@ def _explained(
         columns = columns * (columns.square().mean(1, keepdim=True) > _OWN)
         values_of, vectors = torch.linalg.eigh(columns.mT @ columns)
         kept = values_of > _INDEPENDENT * values_of.amax(-1, keepdim=True).clamp_min(1e-300)
-        along = (vectors.mT @ (columns.mT @ every)).square() / values_of.clamp_min(1e-300)[..., None]
+        along = (vectors.mT @ (columns.mT @ rest.every)).square() / values_of.clamp_min(1e-300)[..., None]
         explained = torch.where(kept[..., None], along, 0.0).sum(1)
         counts = torch.where(values_of.amax(-1) > 0, kept.sum(-1), 0)
         yield from zip(alike, explained, counts.tolist(), strict=True)
