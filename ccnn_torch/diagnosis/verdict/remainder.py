@@ -70,7 +70,7 @@ class _Block(NamedTuple):
 
 # Probability below which a remainder is no noise, where it is more than the form errors of the effects would be along
 # so many directions.
-_UNLIKELY, _DIRECTIONS = 0.01, 20
+_UNLIKELY, _DIRECTIONS = 0.003, 20
 # So many times a known noise is not a noise that was stated a little too small.
 _MANY_TIMES = 2.0
 
