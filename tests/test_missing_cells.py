@@ -67,13 +67,19 @@ def test_heights_beside_few_positions(tmp_path: Path) -> None:
     better, ratios = [], []
     for seed in range(4):
         machine, truth, joints, pose, held = printer(seed)
-        keys = {"mechanism": "delta_linear", "parameters": {"fixed": held}, "noise": "10 um", "split": {"test": 0.2}}
+        keys = {
+            "mechanism": "delta_linear",
+            "parameters": {"fixed": held},
+            "noise": "10 um",
+            "split": {"test": 0.2},
+            "refit": False,
+        }
         mixed = identify(records=str(write(tmp_path / "m.csv", machine, joints, pose)), **keys)
         whole = identify(records=str(write(tmp_path / "w.csv", machine, joints[:12], pose[:12])), **keys)
         assert "x, y are missing in 60 of 72 rows, which count with what was measured" in mixed.results["notes"]
         better.append(left(machine, mixed, truth) / left(machine, whole, truth))
         ratios.append(errors_in_sd(mixed, truth))
-    assert max(better) < 1 and np.exp(np.mean(np.log(better))) < 0.92, better
+    assert np.exp(np.mean(np.log(better))) < 0.8, better
     every = torch.cat(ratios)
     assert len(every) >= 12 and 0.4 < float(every.square().mean().sqrt()) < 1.7, every
 
@@ -140,13 +146,13 @@ def test_a_tracker_that_lost_the_orientation(tmp_path: Path, monkeypatch: pytest
     machine, truth = arm(tmp_path)
     left_by = {}
     for name in ("mixed", "whole"):
-        made = identify(records=f"{name}.csv", mechanism="arm.yaml", links="six", save_report=False)
+        made = identify(records=f"{name}.csv", mechanism="arm.yaml", links="six", refit=False, save_report=False)
         made.save(tmp_path / name)
         found = made.mechanism()
         joints = machine.sample_joints(200, torch.Generator().manual_seed(9))
         there, real = found.forward_kinematics(joints), machine.forward_kinematics(joints, truth)
         left_by[name] = float((there - real)[:, :3].square().sum(-1).mean().sqrt())
-    assert left_by["mixed"] < 0.9 * left_by["whole"] and left_by["mixed"] < 3e-5, left_by
+    assert left_by["mixed"] < 0.8 * left_by["whole"] and left_by["mixed"] < 3e-5, left_by
     code, out, err = cli("verify", "mixed/identified.yaml", "new.csv", "--out", "verified")
     # One of rx, ry, rz alone is no orientation.
     assert code == 0 and "rx, ry, rz are missing in 10 of 40 rows" in out, (out, err)

@@ -171,7 +171,7 @@ def _refitted(config: IdentifyConfig, measured: Measured, method: str, found: Fo
 def _judged(
     config: IdentifyConfig, measured: Measured, outcomes: Mapping[str, Outcome]
 ) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Outcome]]:
-    """The content of `identified.json`, tensors by name for the pictures, and what is told of every method."""
+    """The content of `identified.json`, tensors by name for the pictures, and the outcome of every method."""
     selection, first = select(measured, config), config.methods[0]
     found = {name: judged(config, measured, selection, name, outcome) for name, outcome in outcomes.items()}
     found = {name: _refitted(config, measured, name, one) for name, one in found.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ def test_links_are_found_from_two_stations_and_two_tools(turned: bool, tmp_path:
     inside, ratios = [], []
     for seed in range(3):
         errors = _measured(tmp_path, seed, turned)
-        about = {"records": str(tmp_path / "r.csv"), "save_report": False}
+        about: dict[str, Any] = {"records": str(tmp_path / "r.csv"), "refit": False, "save_report": False}
         about["noise"] = {n: v for n, v in SAID.items() if turned or n in "xyz"}
         found = ccnn_torch.identify(mechanism=str(tmp_path / "arm.yaml"), **about).results
         off, sd = _links(found["parameters"], errors)
@@ -91,7 +92,7 @@ def test_links_are_found_from_two_stations_and_two_tools(turned: bool, tmp_path:
                 keys = about | {"records": str(tmp_path / "one.csv"), "mechanism": str(tmp_path / "alone.yaml")}
                 own_off, own_sd = _links(ccnn_torch.identify(**keys).results["parameters"], errors)
                 assert len(own_off) == len(off) and np.all(own_sd > 1.2 * sd)
-                assert np.mean((own_off / sd) ** 2) > np.mean((off / sd) ** 2)
+                assert np.mean((own_off / sd) ** 2) > 1.5 * np.mean((off / sd) ** 2)
     assert np.mean(inside) > 0.85 and np.sqrt(np.mean(np.square(ratios))) < 1.3, (np.mean(inside), ratios)
 
 
