@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
-from ccnn_torch.diagnosis.candidates.atom import scales
+from ccnn_torch.diagnosis.candidates.atom import scales, textbook_shapes
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
 from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
@@ -284,12 +284,9 @@ def _has_any_period(effect: Effect, situation: Situation) -> bool:
 
 
 def _first(effect: Effect, situation: Situation) -> Known:
-    """An effect at the shapes of the textbook: once a turn, for one; without what can have any period."""
-    shapes, every = effect.shapes(situation), effect.coefficients(situation)
-    value = [s.grid[0] if s.usual is None else s.usual for s in shapes]
-    open_to = {c for s in shapes if s.refined and s.usual is None for c in s.columns or range(len(every))}
-    used = tuple(k for k in range(len(every)) if k not in open_to)
-    return Known(effect, torch.tensor(value, dtype=torch.float64), torch.zeros(len(every), dtype=torch.float64), used)
+    """An effect at the shapes of the textbook, without what can have any period."""
+    value, used = textbook_shapes(situation, effect)
+    return Known(effect, value, value.new_zeros(len(effect.coefficients(situation))), used)
 
 
 def _at_better_shape(rows: _Rows, i: int, scan: Scan) -> _Rows:

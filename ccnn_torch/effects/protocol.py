@@ -64,6 +64,11 @@ class Shape:
     usual: float | None = None
     refined: bool = True
 
+    @property
+    def textbook(self) -> float | None:
+        """The value that needs no search: the usual one, or the first of those that are counted (once a turn)."""
+        return self.grid[0] if self.usual is None and not self.refined else self.usual
+
 
 @runtime_checkable
 class Effect(Protocol):

@@ -55,6 +55,21 @@ def near_singular(said: Diagnosis) -> list[int]:
     return rows
 
 
+@pytest.mark.parametrize("machine", ["five_bar", "delta"])
+def test_an_eccentric_encoder_is_no_weight(machine: str) -> None:
+    """A wave once a turn needs no search, though what hangs on a crank makes nearly the same one."""
+    mechanism, g = load_mechanism(machine), torch.Generator().manual_seed(1)
+    pose = mechanism.sample_workspace(150, g)
+    joints = mechanism.solve_inverse(pose)
+    phase = torch.arange(joints.shape[1]) * 0.7 + 1
+    reached = mechanism.forward_kinematics(joints + 1e-3 * torch.sin(joints + phase), guess=pose)
+    reached += 1e-5 * torch.randn(reached.shape, generator=g, dtype=torch.float64)
+    said = diagnose_rows(Situation(mechanism, joints, {}, default_gravity(mechanism), None, pose), reached)
+    assert said.verdict["effects"] == ["transmission"]
+    # A third of a period is seen.
+    assert said.verdict["probability"] <= 0.6
+
+
 def test_noise_alone_is_no_cause() -> None:
     situation = rows_of("five_bar", 200, 5)
     said = diagnose_rows(situation, measured(situation, {}, 6))

@@ -87,3 +87,13 @@ def default_shape(situation: Situation, effect: Effect) -> Tensor:
     """The middle of every grid, `h`."""
     grids = [s.grid for s in effect.shapes(situation)]
     return torch.tensor([g[len(g) // 2] for g in grids], dtype=situation.joints.dtype, device=situation.joints.device)
+
+
+def textbook_shapes(situation: Situation, effect: Effect) -> tuple[Tensor, tuple[int, ...]]:
+    """The shapes for which nobody needs to look, `h` (once a turn, for one), and the coefficients that none depends on
+    for which one has to."""
+    shapes, count = effect.shapes(situation), len(effect.coefficients(situation))
+    value = [s.grid[0] if s.textbook is None else s.textbook for s in shapes]
+    searched = {c for s in shapes if s.textbook is None for c in s.columns or range(count)}
+    used = tuple(k for k in range(count) if k not in searched)
+    return torch.tensor(value, dtype=situation.joints.dtype, device=situation.joints.device), used

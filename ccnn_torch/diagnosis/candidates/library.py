@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.candidates.atom import Atom, default_shape
+from ccnn_torch.diagnosis.candidates.atom import Atom, default_shape, textbook_shapes
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows, Shaped
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.rows import only_usable
@@ -167,11 +167,11 @@ def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped
 
 
 def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
-    """The shapes of the textbook, which need no search; none where an effect has no usual ones."""
-    usual = [s.usual for s in effect.shapes(situation)]
-    if any(value is None for value in usual):
+    """The shapes of the textbook, which need no search; none where an effect has no such ones."""
+    value, used = textbook_shapes(situation, effect)
+    if not used:
         return []
-    return [Shaped(torch.tensor(usual, dtype=situation.joints.dtype), None, 0.0)]
+    return [Shaped(value, None if len(used) == len(effect.coefficients(situation)) else used, 0.0)]
 
 
 def _charged(atom: Atom) -> Atom:

@@ -36,7 +36,8 @@ _PAYS = 1.5
 
 class Shaped(NamedTuple):
     """Shapes found: `value` `h`; `used`, the coefficients whose shape is worth its charge (None = all); and `charge`,
-    what looking for them costs in log odds: the logarithm of the share of the values evaluated that do as well."""
+    what looking for them costs in log odds: the logarithm of the share of the values evaluated that do as well, and
+    nothing for those of the textbook."""
 
     value: Tensor
     used: tuple[int, ...] | None
@@ -204,7 +205,9 @@ class Scan:
                         score = times * (left.gain(tried) - tried.width) + tried.width
                         chosen[i] = _likeliest(left, tried, score) if level == 0 else int(score.argmax())
                         gains[i] = float(score[chosen[i]])
-                        spent[i] = search_charge(score) if level == 0 else 0.0
+                        if level == 0:
+                            known = self._is_textbook(candidates[chosen[i]], self.parts[i])
+                            spent[i] = 0.0 if known else search_charge(score)
                 charges = [c + s for c, s in zip(charges, spent, strict=True)]
                 value = value.clone()
                 for i, part in enumerate(self.parts):
@@ -262,6 +265,10 @@ class Scan:
         half = (high - low) / 2 * (2 / (FINE - 1)) ** (level - 1)
         fine = torch.linspace(-1, 1, FINE, dtype=grid.dtype) * half + value
         return fine.clamp(float(grid[0]), float(grid[-1]))
+
+    def _is_textbook(self, value: Tensor, part: _Part) -> bool:
+        """Whether the shapes of a part are those for which nobody needs to look."""
+        return all(float(value[h]) == self.shapes[h].textbook for h in part.shapes)
 
     def _nearest(self, candidates: Tensor, value: Tensor, part: _Part) -> int:
         return int((candidates[:, part.shapes] - value[part.shapes]).abs().sum(-1).argmin())
