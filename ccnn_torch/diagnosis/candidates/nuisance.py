@@ -16,7 +16,7 @@ from ccnn_torch.evidence.priors import WIDE
 
 # Relative ridge of the regression on a candidate.
 _RIDGE = 1e-6
-FINE, ROUNDS = 9, 3
+FINE, ROUNDS = 9, 5
 """Values between the neighbours of the best of a grid, and how often there are such between those of the last."""
 
 

@@ -28,6 +28,10 @@ _CHANCE = 5.0
 _START, _THEN, _MOST = (900, 4), (1500, 2), 4800
 # Values of a grid that explain so little less than the best may be meant, a few of them, where it is more than chance.
 _AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
+# Peaks of a grid between whose neighbours values are evaluated: the four harmonics of a half, a third or a quarter of a
+# frequency do nearly what those of the whole one do, and which is better shows only between the values of the grid,
+# where peaks go on that are lower by no more than such a share.
+_PEAKS, _AS_HIGH = 4, 0.02
 # Shapes that share coefficients are searched together where that are no more values.
 _TOGETHER = 150
 # Log evidence for each coefficient whose shape is worth its search.
@@ -187,10 +191,11 @@ class Scan:
         gains = [0.0] * len(self.parts)
         charges = [0.0] * len(self.parts)
         plain, times = ground.left.beside(_of(self.unshaped, ground.rows, 0)), ground.times
+        peaks: list[Tensor | None] = [None] * len(self.parts)
         for level in range(ground.rounds + 1):
             if level == 1 and not self._promising(gains, charges):
                 break
-            for candidates, pieces, looked_at in self._level(value, level, ground.rows):
+            for candidates, pieces, looked_at in self._level(value, level, ground.rows, peaks):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
                 spent = [0.0] * len(self.parts)
                 # Beside each other: over the grid once each alone before, and then about what that has found.
@@ -203,7 +208,16 @@ class Scan:
                         left = plain.beside(torch.cat(own, -1)) if own else plain
                         # What chance explains does not grow with the rows.
                         score = times * (left.gain(tried) - tried.width) + tried.width
-                        chosen[i] = _likeliest(left, tried, score) if level == 0 else int(score.argmax())
+                        if level == 0:
+                            chosen[i] = _likeliest(left, tried, score)
+                            about = _peaks(score, chosen[i])
+                        else:
+                            # Near the best value sizes that no coefficient is likely to have are no explanation.
+                            likely = score if level == 1 else left.log_evidence(tried, torch.arange(len(score)))
+                            about = _tops(score, likely)
+                            chosen[i] = int(about[likely[about].argmax()])
+                        if len(self.parts[i].shapes) == 1:
+                            peaks[i] = candidates[about, self.parts[i].shapes[0]]
                         gains[i] = float(score[chosen[i]])
                         if level == 0:
                             known = self._is_textbook(candidates[chosen[i]], self.parts[i])
@@ -219,11 +233,14 @@ class Scan:
         parts = zip(self.parts, gains, charges, strict=True)
         return any((gain - len(part.columns)) / 2 - charge > _CHANCE for part, gain, charge in parts)
 
-    def _level(self, value: Tensor, level: int, rows: Tensor | None) -> list[_Turn]:
-        """Candidates with their columns: of every part all its shapes at once where that are few, else one by one."""
+    def _level(self, value: Tensor, level: int, rows: Tensor | None, peaks: Sequence[Tensor | None]) -> list[_Turn]:
+        """Candidates with their columns: of every part all its shapes at once where that are few, else one by one.
+
+        peaks: of each part the values of its one shape about which to look, or None.
+        """
         if level == 0 and self.coarse is not None:
             return self.coarse
-        tables = [self._tables(value, part, level) for part in self.parts]
+        tables = [self._tables(value, part, level, own) for part, own in zip(self.parts, peaks, strict=True)]
         found = []
         for turn in range(max(map(len, tables), default=0)):
             mine = [
@@ -242,9 +259,11 @@ class Scan:
             self.coarse = found
         return found
 
-    def _tables(self, value: Tensor, part: _Part, level: int) -> list[Tensor]:
+    def _tables(self, value: Tensor, part: _Part, level: int, peaks: Tensor | None) -> list[Tensor]:
         """Values to look at, one table a turn, `g x (shapes of the part)`."""
         grids = [self._grid(h, float(value[h]), level) for h in part.shapes]
+        if peaks is not None:
+            grids = [torch.cat([self._grid(part.shapes[0], float(peak), level) for peak in peaks])]
         if len(grids) > 1 and level == 0 and math.prod(map(len, grids)) <= _TOGETHER:
             return [torch.cartesian_prod(*grids)]
         found = []
@@ -286,6 +305,25 @@ class Scan:
             return Shaped(value, None, charge)
         unshaped = set(range(len(self.size))) - {c for p in self.parts for c in p.columns}
         return Shaped(value, tuple(sorted(unshaped | {c for i in kept for c in self.parts[i].columns})), charge)
+
+
+def _peaks(score: Tensor, chosen: int) -> Tensor:
+    """Numbers of the values of a grid about which to look on: the chosen one, and the highest of the other peaks."""
+    edge = score.new_full((1,), -math.inf)
+    higher = (score > torch.cat([edge, score[:-1]])) & (score > torch.cat([score[1:], edge]))
+    higher[chosen] = False
+    others = torch.nonzero(higher).squeeze(-1)
+    others = others[score[others].argsort(descending=True)[: _PEAKS - 1]]
+    return torch.cat([others.new_tensor([chosen]), others])
+
+
+def _tops(score: Tensor, likely: Tensor) -> Tensor:
+    """Numbers of the likeliest values about each peak, of the peaks that explain about as much as the best of them."""
+    tops = likely.reshape(-1, FINE).argmax(-1)
+    tops += FINE * torch.arange(len(tops))
+    most = float(score[tops].max())
+    high: Tensor = tops[score[tops] >= most - max(_AS_WELL, _AS_HIGH * most)]
+    return high
 
 
 def _likeliest(left: NuisanceFit, tried: TrialColumns, score: Tensor) -> int:

@@ -149,7 +149,7 @@ def parameter_table(results: Block, most: int = 24) -> Table | None:
             # Of a turning joint: whole numbers a turn.
             unit = "times a turn" if name.endswith(" frequency") and block["unit"] == "1" else unit
             rows.append((f"{effect}: {block.get('word') or name}", *numbers, unit))
-            sizes.append(abs(value) / sd if sd else math.inf)
+            sizes.append(abs(value) / sd if sd and not block.get("searched") else math.inf)
     if not rows:
         return None
     columns = ("parameter", "value", "standard deviation", "95 % interval", "unit")

@@ -14,9 +14,9 @@ from ccnn_torch.diagnosis.result import effect_block, gap_block
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
 from ccnn_torch.diagnosis.verdict.fewest import fewest, together
+from ccnn_torch.diagnosis.verdict.intervals import spread_of
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Coefficient
-from ccnn_torch.evidence.dictionary import covariance
 from ccnn_torch.evidence.shrink import Gap, HeldOut, draws, shrink_of
 
 
@@ -114,7 +114,8 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
     assert atom.effect is not None
     start = sum(len(m) for m in own.mean[:place])
     mean, here = own.mean[place], slice(start, start + len(own.mean[place]))
-    spread = covariance(analysis.dictionary, own)[here, here]
+    whole = spread_of(analysis, own)
+    spread = whole.coefficients[here, here]
     deviation = spread.diagonal().clamp_min(0).sqrt()
     needed: dict[str, int] = {}
     if atom.effect.kind == "parameters":
@@ -145,9 +146,10 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
             joint, middle = mechanism.joints[i], float(analysis.situation.middle[i])
             found[coefficient]["about"] = {"joint": joint.name, "value": middle, "unit": joint.unit}
     used = None if atom.used is None else set(atom.used)
-    for shape, value in zip(atom.effect.shapes(analysis.situation), atom.shape.tolist(), strict=True):
+    for h, (shape, value) in enumerate(zip(atom.effect.shapes(analysis.situation), atom.shape.tolist(), strict=True)):
         if used is None or shape.columns is None or used & set(shape.columns):
-            found[shape.name] = {"value": value, "sd": None, "unit": shape.unit}
+            deviation_of = whole.shapes.get((place, h))
+            found[shape.name] = {"value": value, "sd": deviation_of, "unit": shape.unit, "searched": True}
     return found
 
 

@@ -90,7 +90,8 @@ def findings(results: Block) -> list[Finding]:
 
 def clear_parameters(parameters: Block) -> dict[str, Block]:
     """The coefficients that are clearly not 0, those that are largest against their standard deviations first."""
-    clear = {n: b for n, b in parameters.items() if b["sd"] and abs(b["value"]) > _CLEAR * b["sd"]}
+    sized = {n: b for n, b in parameters.items() if b["sd"] and not b.get("searched")}
+    clear = {n: b for n, b in sized.items() if abs(b["value"]) > _CLEAR * b["sd"]}
     return dict(sorted(clear.items(), key=lambda item: -abs(item[1]["value"]) / item[1]["sd"]))
 
 

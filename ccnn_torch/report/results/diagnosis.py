@@ -84,6 +84,8 @@ class Coefficient(Result):
     """what people call it, where the machine's file says so"""
     shown: str = ""
     """the unit that they tell it in"""
+    searched: bool = False
+    """whether it is a period, a time constant or the like, for which values were tried: not to be told from 0"""
     about: About | None = None
     """of a gain: the joint that it multiplies, and the command of it from which it counts [SI]"""
 
