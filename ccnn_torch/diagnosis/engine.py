@@ -225,7 +225,7 @@ def _diagnosis(said: _Judged, is_given: bool, seed: int) -> Diagnosis:
         notes=_notes(said, unseen, missing, proposed),
         machine=None,
     )
-    return Diagnosis(content, tuple(analysis.acting(judgement.found)), analysis, judgement, inferred=said.inferred)
+    return Diagnosis(content, tuple(analysis.acting(judgement.acting)), analysis, judgement, inferred=said.inferred)
 
 
 def _notes(

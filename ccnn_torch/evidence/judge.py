@@ -96,9 +96,9 @@ def judge(
     unknown = sum(e.probability for e in explanations if e.drivers)
     outside = unknown > OUTSIDE
     chosen = next(e for e in explanations if bool(e.drivers) == outside)
-    likely, classes = chosen.names, {} if outside else classes_of(every, chosen.names)
+    likely, classes = chosen, {} if outside else classes_of(every, chosen.names)
     like = classes if of_classes else {}
-    sure = frozenset(n for n in likely if marginal(explanations, n, *like.get(n, ())) >= NAMED)
+    sure = frozenset(n for n in likely.names if marginal(explanations, n, *like.get(n, ())) >= NAMED)
     fewer = next((e for e in explanations if e.names == sure and bool(e.drivers) == outside), chosen)
     if (sure or outside) and (not of_classes or fewer.probability * ODDS > chosen.probability):
         chosen, classes = fewer, {} if outside else classes_of(every, fewer.names)
@@ -106,7 +106,8 @@ def judge(
     if outside:
         most = BESIDE_UNKNOWN if chosen.names else 1.0
         return Verdict(chosen, classes, min(unknown, most), outside, drivers)
-    if (rest := rest_of(chosen)) is not None:
+    # What names that are likely but not sure take away is no rest that the library lacks.
+    if (rest := rest_of(chosen)) is not None and (likely is chosen or rest_of(likely) is not None):
         # A set with a discrepancy term that leaves noise goes before one that does not. Where none does, what is only
         # sure as one of a class is not named: the unknown cause can look like all of it.
         beside = [e for e in explanations if e.drivers]
@@ -116,7 +117,7 @@ def judge(
         return Verdict(other, {}, BESIDE_UNKNOWN, True, other.drivers or rest)
     inside = [e for e in explanations if not e.drivers]
     same = sum(e.probability for e in inside if is_same(e.names, chosen.names, classes))
-    if chosen.names < likely:
+    if chosen.names < likely.names:
         # Further effects usually correct the form of those that are named: their sets support the verdict.
         same = min(same + sum(e.probability for e in inside if chosen.names < e.names), NAMED)
     return Verdict(chosen, classes, min(same, 1.0), False, ())

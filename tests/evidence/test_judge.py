@@ -53,6 +53,12 @@ def test_names_are_those_of_the_most_probable_set_that_are_sure(shares: Shares, 
     assert said(verdict(shares)) == ({*names.split()}, probability, False, ())
 
 
+def test_a_rest_that_a_likely_name_takes_is_not_outside() -> None:
+    shares = {"a b": 0.6, "a": 0.395, "": 0.005}
+    assert said(verdict(shares, "a")) == ({"a"}, 0.9, False, ())
+    assert said(verdict(shares, "a", "a b")) == ({"a"}, 0.6, True, ("rest",))
+
+
 def test_where_names_have_few_forms_one_that_is_sure_as_one_of_a_class_stays() -> None:
     def names(shares: Shares, of_classes: bool) -> str:
         made = explained(shares)

@@ -172,12 +172,13 @@ def _listed(said: Diagnosis | None) -> dict[str, Mapping[str, Any]]:
 def _numbers(entry: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     """Value and standard deviation of each number that is told."""
     every = entry["parameters"].items()
-    return {name: (p["value"], p["sd"]) for name, p in every if p.get("sd") is not None and p["value"]}
+    told = {name: p for name, p in every if p.get("sd") is not None and not p.get("searched")}
+    return {name: (p["value"], p["sd"]) for name, p in told.items() if p["value"]}
 
 
 def _same_shape(number: str, one: Mapping[str, Any], two: Mapping[str, Any]) -> bool:
     """Whether what a number multiplies has the same period, time constant and the like: of its joint, or of all."""
-    shapes = [{n: p["value"] for n, p in every.items() if p.get("sd") is None} for every in (one, two)]
+    shapes = [{n: p["value"] for n, p in every.items() if p.get("searched")} for every in (one, two)]
     joints = {n.split()[0] for every in (one, two) for n in every} - {number.split()[0]}
     mine = [n for n in {**shapes[0], **shapes[1]} if " " not in n or n.split()[0] not in joints]
     return all(

@@ -202,7 +202,7 @@ def _of_nothing_gained(analysis: Analysis, judgement: Judgement, together: Gap) 
 def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Causes of the verdict that would have to be hundreds of times as large as in any machine."""
     said, most = [], implausible_size(analysis)
-    for i, mean in zip(judgement.found.members, judgement.found.mean, strict=True):
+    for i, mean in zip(judgement.acting.members, judgement.acting.mean, strict=True):
         atom = analysis.atoms[i]
         coefficients = atom.coefficients(analysis.situation)
         if atom.name not in judgement.names or not coefficients:
@@ -223,7 +223,7 @@ def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
 def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Causes of the verdict whose coefficients are clearly negative where physics has none such, and none positive."""
     said, first = [], 0
-    found = judgement.found
+    found = judgement.acting
     for i, mean in zip(found.members, found.mean, strict=True):
         atom, part = analysis.atoms[i], slice(first, first + len(mean))
         first += len(mean)

@@ -105,7 +105,7 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
     """
     analysis = made.analysis
     atoms = analysis.atoms
-    own = made.judgement.fullest if name in made.judgement.names else made.judgement.found
+    own = made.judgement.fullest if name in made.judgement.names else made.judgement.acting
     if not any(atoms[i].name == name for i in own.members):
         alone = made.candidates[name]
         own = next(f for f in analysis.found if f.members == (alone,))

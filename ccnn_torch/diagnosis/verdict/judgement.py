@@ -40,8 +40,10 @@ class Judgement:
 
     Attributes:
         found: the set that represents the verdict.
-        fullest: the most probable set that has the same members and more, whose coefficients are told; `found` itself
-            where there is none.
+        acting: its effects without discrepancy terms, fitted without these: a machine with their numbers is the nearest
+            one that the names can be, and the one that rows outside the fit have judged.
+        fullest: the most probable set that has the members of `acting` and more, whose coefficients are told; `acting`
+            itself where there is none, or something is outside.
         names: library effects, the favourite of each class.
         classes: for each of them the names that cannot be distinguished from it.
         probability: that the verdict, classes taken as one, is right.
@@ -52,6 +54,7 @@ class Judgement:
     """
 
     found: FittedSet
+    acting: FittedSet
     fullest: FittedSet
     names: tuple[str, ...]
     classes: Mapping[str, tuple[str, ...]]
@@ -98,9 +101,16 @@ def judge_rows(analysis: Analysis) -> Judgement:
         ),
         key=lambda f: -f.log_posterior,
     )
+    acting = found
+    if verdict.outside:
+        effects = tuple(i for i in found.members if not analysis.atoms[i].is_discrepancy)
+        acting = _fits(analysis.dictionary, [effects], {f.members: f for f in analysis.found})[0]
     return Judgement(
         found=found,
-        fullest=next((f for f in more if f is found or _is_least(analysis, f.members)), found),
+        acting=acting,
+        fullest=acting
+        if verdict.outside
+        else next((f for f in more if f is found or _is_least(analysis, f.members)), found),
         names=tuple(sorted(names, key=lambda n: -_energy(analysis, found, n))),
         classes=verdict.classes,
         probability=verdict.probability,
@@ -192,7 +202,7 @@ def _time_first(
 def without_names(analysis: Analysis, judgement: Judgement) -> Judgement:
     """None in the place of names that are not likely and that no row outside the fit shows."""
     empty = next(f for f in analysis.found if not f.members)
-    return replace(judgement, found=empty, fullest=empty, names=(), classes={}, probability=0.5)
+    return replace(judgement, found=empty, acting=empty, fullest=empty, names=(), classes={}, probability=0.5)
 
 
 def _explanations(

@@ -1,9 +1,9 @@
 """Is what a verdict leaves noise? A test of the whole answer against everything that the rows record.
 
 What the named effects leave, in units of a robust noise of each channel and clipped, is compared with functions of each
-driver: smooth ones, in every channel and through every joint; own ones of a joint; products of two; steps at a row. The
-order of the rows is drawn anew for what would be found in noise (a permutation test; Freedman and Lane 1983), and the
-smallest probability counts for as many families as were tried.
+driver: smooth ones, in every channel, in one, and through every joint; own ones of a joint; products of two; steps at a
+row. The order of the rows is drawn anew for what would be found in noise (a permutation test; Freedman and Lane 1983),
+and the smallest probability counts for as many families as were tried.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ccnn_torch.diagnosis.discrepancy.smooth import PLACE, driver_of, unit_range
 from ccnn_torch.diagnosis.residual.whitening import MAD
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.evidence.dictionary import FittedSet
-from ccnn_torch.evidence.form_error import form_error_of, is_unexplained
+from ccnn_torch.evidence.form_error import is_unexplained
 
 # Values beyond this many robust standard deviations count as this many: tails are no structure.
 _CLIP, _SCALINGS = 2.5, 3
@@ -44,12 +44,12 @@ class Remainder(NamedTuple):
     Attributes:
         probability: of as strong a one in noise.
         driver: what it follows, as a discrepancy term is called.
-        share: of the gap that it makes.
+        excess: its squares over those that errors of the effects' forms may have, in the channel where it is largest.
     """
 
     probability: float
     driver: str
-    share: float
+    excess: float
 
 
 class _Block(NamedTuple):
@@ -59,7 +59,7 @@ class _Block(NamedTuple):
         driver: what they follow.
         family: those among which the strongest counts.
         values: `s x m`.
-        through: "channels", "joints", or the number of a joint, "0" the first.
+        through: "channels", "joints", one of them: "channel 0", "joint 0".
     """
 
     driver: str
@@ -79,8 +79,7 @@ def rest_of(analysis: Analysis, found: FittedSet) -> tuple[str, ...] | None:
     """What the remainder of a set follows; () where it is far more than a known noise and follows nothing; None where
     it is noise, or nothing tells."""
     rest = remainder_of(analysis, found)
-    allowed = _DIRECTIONS * form_error_of(found, analysis.dictionary) / analysis.gap
-    if rest and rest.probability < _UNLIKELY and rest.share > allowed:
+    if rest and rest.probability < _UNLIKELY and rest.excess > 1:
         return (rest.driver,)
     return () if analysis.noise_is_known and times_the_noise(analysis, found) > _MANY_TIMES else None
 
@@ -100,14 +99,14 @@ class _Left(NamedTuple):
         basis: orthonormal directions of what was fitted, `s c x k`.
         target: what was to be explained, `s c`.
         every: what is left, clipped and as it is, then orders of its rows, `s c x p`.
-        frames: what fitted frames do, `s c x r`.
+        form: squares that errors of the effects' forms may have in each channel, `c`.
         jacobian: by the joints, `s x c x n`.
     """
 
     basis: Tensor
     target: Tensor
     every: Tensor
-    frames: Tensor
+    form: Tensor
     jacobian: Tensor
 
 
@@ -129,8 +128,8 @@ def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
     free = len(rest.basis) - rest.basis.shape[1]
     total = rest.every.square().sum(0) - (rest.basis.mT @ rest.every).square().sum(0)
     best: dict[str, Tensor] = {}
-    strongest = -torch.inf, "", 0.0
-    for block, explained, count in _explained([*_blocks(_drivers(analysis, keep[taken]))], rest):
+    strongest: tuple[float, _Block] | None = None
+    for block, explained, count in _explained([*_blocks(_drivers(analysis, keep[taken]), channels)], rest):
         if not count or free - count < _FEWEST:
             continue
         ratio = (explained / count) / ((total - explained).clamp_min(1e-300) / (free - count))
@@ -138,16 +137,26 @@ def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
         best[block.family] = torch.maximum(score, best.get(block.family, score))
         # Of many drivers that go together the one that needs least for it (Schwarz 1978).
         evidence = float(free * (total / (total - explained))[0].log() - count * math.log(free)) / 2
-        extra = float(explained[1] - count * (total[1] - explained[1]) / (free - count))
-        strongest = max(strongest, (evidence, block.driver, extra))
-    if not best:
+        if strongest is None or evidence > strongest[0]:
+            strongest = evidence, block
+    if strongest is None:
         return None
+    block = strongest[1]
     smallest = min(_tail(float(score[0]), score[2:]) for score in best.values())
-    _, driver, extra = strongest
-    frames = _basis(rest.frames)
-    gap = float(rest.target.square().sum() - (frames.mT @ rest.target).square().sum()) - len(rest.target)
-    parts = dict.fromkeys(PLACE if part.startswith(PLACE) else part for part in driver.split(CROSS))
-    return Remainder(min(1.0, len(best) * smallest), CROSS.join(parts), extra / max(gap, 1.0))
+    parts = dict.fromkeys(PLACE if part.startswith(PLACE) else part for part in block.driver.split(CROSS))
+    return Remainder(min(1.0, len(best) * smallest), CROSS.join(parts), _excess(block, rest))
+
+
+def _excess(block: _Block, rest: _Left) -> float:
+    """As in `Remainder`: in units of a channel's own noise, since one may be far noisier than the others."""
+    channels = rest.jacobian.shape[1]
+    own = _basis(_columns([block], rest)[0])
+    left = rest.every[:, 1]
+    found = own @ (own.mT @ left)
+    noise = (left - found).square().sum() / max(len(left) - rest.basis.shape[1] - own.shape[1], 1)
+    by_channel = (found.square() - noise * own.square().sum(-1)).reshape(-1, channels).sum(0)
+    most = int(by_channel.argmax())
+    return float(by_channel[most] / rest.form[most].clamp_min(1e-300))
 
 
 def _left(analysis: Analysis, found: FittedSet, taken: Tensor, order: torch.Generator) -> _Left | None:
@@ -169,7 +178,12 @@ def _left(analysis: Analysis, found: FittedSet, taken: Tensor, order: torch.Gene
     by_row = (clipped - basis @ (basis.mT @ clipped)).reshape(rows, channels)
     drawn = [by_row[torch.randperm(rows, generator=order)].flatten() for _ in range(_ORDERS)]
     every = torch.stack([by_row.flatten(), left, *drawn], -1)
-    return _Left(basis, y, every, (columns[0] * used[:, None]).flatten(0, 1), jacobian * used[:, None])
+    form = torch.zeros(channels, dtype=torch.float64)
+    for i, mean in zip(found.members, found.mean, strict=True):
+        (done,) = _whitened(analysis, [analysis.atoms[i].columns @ mean[:, None]], taken)
+        squares = torch.minimum((done[..., 0] * used).square().sum(0), y.reshape(rows, channels).square().sum(0))
+        form += _DIRECTIONS * analysis.atoms[i].form_error * squares
+    return _Left(basis, y, every, form, jacobian * used[:, None])
 
 
 def _drivers(analysis: Analysis, keep: Tensor) -> Mapping[str, Tensor]:
@@ -187,26 +201,27 @@ def _drivers(analysis: Analysis, keep: Tensor) -> Mapping[str, Tensor]:
     return {n: unit_range(v[:, None])[:, 0] for n, v in found.items() if float(v.max() - v.min()) > 1e-9}
 
 
-def _blocks(drivers: Mapping[str, Tensor]) -> Iterator[_Block]:
+def _blocks(drivers: Mapping[str, Tensor], channels: int) -> Iterator[_Block]:
     joints = [name for name in drivers if name.startswith("joint ")]
     for name, value in drivers.items():
         smooth = _polynomials(value, _DEGREE) if _is_many(value) else value[:, None]
         yield _Block(name, "smooth", smooth, "channels")
         yield _Block(name, "smooth", smooth, "joints")
+        yield from (_Block(name, "channel", smooth, f"channel {k}") for k in range(channels))
     for i, name in enumerate(joints):
         waves = drivers[name][:, None] * torch.pi * torch.tensor(_WAVES)
         yield _Block(
-            name, "own", torch.cat([_polynomials(drivers[name], _DEGREE), waves.sin(), waves.cos()], -1), str(i)
+            name, "own", torch.cat([_polynomials(drivers[name], _DEGREE), waves.sin(), waves.cos()], -1), f"joint {i}"
         )
     for name in (n for n in drivers if n.startswith("direction ") and n[10:].isdigit()):
         i, value = int(name[10:]) - 1, drivers[name][:, None]
         if i >= len(joints):
             continue
         own = torch.cat([torch.ones_like(value), _polynomials(drivers[joints[i]], 4)], -1)
-        yield _Block(name, "direction", value * own, str(i))
+        yield _Block(name, "direction", value * own, f"joint {i}")
         for other in (n for n, v in drivers.items() if n != name and _is_many(v)):
             both = value * _polynomials(drivers[other], 2)
-            yield _Block(name + CROSS + other, "direction pair", both, str(i))
+            yield _Block(name + CROSS + other, "direction pair", both, f"joint {i}")
     rows = len(next(iter(drivers.values())))
     steps = (torch.arange(rows) >= (k * rows) // (2 * _PARTS) for k in range(1, 2 * _PARTS))
     for step in steps:
@@ -219,27 +234,35 @@ def _blocks(drivers: Mapping[str, Tensor]) -> Iterator[_Block]:
 def _explained(blocks: list[_Block], rest: _Left) -> Iterator[tuple[_Block, Tensor, int]]:
     """Squares of what is left, and of every order drawn, that each block explains beside what was fitted, and by how
     many directions; blocks of one shape at once."""
-    basis, jacobian = rest.basis, rest.jacobian
-    rows, channels, joints = jacobian.shape
-    eye = torch.eye(channels, dtype=torch.float64).expand(rows, -1, -1)
+    _, channels, joints = rest.jacobian.shape
     kinds: dict[tuple[int, int], list[_Block]] = {}
     for block in blocks:
         width = {"channels": channels, "joints": joints}.get(block.through, 1)
         kinds.setdefault((width, block.values.shape[-1]), []).append(block)
     for alike in kinds.values():
-        through = {"channels": eye, "joints": jacobian, **{str(i): jacobian[..., [i]] for i in range(joints)}}
-        maps = torch.stack([through[b.through] for b in alike])
-        values = torch.stack([b.values for b in alike])
-        columns = (maps[..., None] * values[:, :, None, None, :]).reshape(len(alike), rows * channels, -1)
-        columns = columns / columns.square().mean(1, keepdim=True).sqrt().clamp_min(1e-300)
-        columns = columns - basis @ (basis.mT @ columns)
-        columns = columns * (columns.square().mean(1, keepdim=True) > _OWN)
+        columns = _columns(alike, rest)
         values_of, vectors = torch.linalg.eigh(columns.mT @ columns)
         kept = values_of > _INDEPENDENT * values_of.amax(-1, keepdim=True).clamp_min(1e-300)
         along = (vectors.mT @ (columns.mT @ rest.every)).square() / values_of.clamp_min(1e-300)[..., None]
         explained = torch.where(kept[..., None], along, 0.0).sum(1)
         counts = torch.where(values_of.amax(-1) > 0, kept.sum(-1), 0)
         yield from zip(alike, explained, counts.tolist(), strict=True)
+
+
+def _columns(alike: list[_Block], rest: _Left) -> Tensor:
+    """What blocks of one shape do beside what was fitted, `b x (s c) x m`; 0 where that is next to nothing."""
+    rows, channels, joints = rest.jacobian.shape
+    eye = torch.eye(channels, dtype=torch.float64).expand(rows, -1, -1)
+    through = {"channels": eye, "joints": rest.jacobian}
+    through |= {f"channel {k}": eye[..., [k]] for k in range(channels)}
+    through |= {f"joint {i}": rest.jacobian[..., [i]] for i in range(joints)}
+    maps = torch.stack([through[b.through] for b in alike])
+    values = torch.stack([b.values for b in alike])
+    columns = (maps[..., None] * values[:, :, None, None, :]).reshape(len(alike), rows * channels, -1)
+    columns = columns / columns.square().mean(1, keepdim=True).sqrt().clamp_min(1e-300)
+    columns = columns - rest.basis @ (rest.basis.mT @ columns)
+    kept: Tensor = columns * (columns.square().mean(1, keepdim=True) > _OWN)
+    return kept
 
 
 def _of_effects(analysis: Analysis, found: FittedSet) -> Iterator[Tensor]:
