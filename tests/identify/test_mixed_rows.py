@@ -16,6 +16,8 @@ from ccnn_torch.api import identify
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.compensation import load_compensation
+from ccnn_torch.diagnosis.from_records import situation_of
+from ccnn_torch.effects import Acting, make_effect, reached, signature
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.planning.config import PlanConfig
@@ -207,3 +209,36 @@ def test_instruments_that_cannot_stand_together_are_refused(tmp_path: Path) -> N
     machine = load_mechanism("instrument", mechanism=arm, instruments=INSTRUMENTS[1:])
     with pytest.raises(InputError, match=r"column 'anchor' is empty at line .* where distance was read"):
         load_records(str(records), machine)
+
+
+def test_distances_between_two_places_stand_beside_heights(tmp_path: Path) -> None:
+    """A cause at the joints acts at both places of a distance, and once on what is read at the first alone."""
+    arm, rng = Arm(4), np.random.default_rng(3)
+    pairs, spots = joints(120, 9).reshape(60, 2, 6), joints(60, 10)
+    far = np.array([np.linalg.norm(arm.tip(a) - arm.tip(b)) for a, b in pairs]) + rng.normal(0, 1e-5, 60)
+    heights = np.array([arm.tip(v)[2] for v in spots]) + rng.normal(0, 1e-5, 60)
+    empty = np.full((60, 6), np.nan)
+    none = empty[:, :1]
+    every = np.block([[pairs[:, 0], pairs[:, 1], far[:, None], none], [spots, empty, none, heights[:, None]]])
+    header = ",".join([*(f"q{i + 1}{end}[rad]" for end in ("", "_b") for i in range(6)), "distance[m]", "z[m]"])
+    lines = [",".join("" if np.isnan(v) else f"{v:.15g}" for v in row) for row in every]
+    (tmp_path / "rows.csv").write_text("\n".join([header, *lines]) + "\n")
+    instruments = [{"kind": "between"}, {"kind": "pose", "pose": ["z"]}]
+    keys = {"mechanism": str(arm_file(tmp_path, frames=False)), "instruments": instruments}
+    machine = load_mechanism("instrument", **keys)  # type: ignore[arg-type]
+    records = load_records(str(tmp_path / "rows.csv"), machine)
+    here = situation_of(records, machine)
+    effect = make_effect("joint_gain", machine)
+    shape = torch.zeros(0, dtype=torch.float64)
+    size = 1e-6 * torch.randn(len(effect.coefficients(here)), generator=torch.Generator().manual_seed(1)).double()
+    moved = reached(here, [Acting(effect, shape, size)]) - reached(here, [])
+    seen = ~records.pose[:, :2].isnan()
+    linear = (signature(here, effect, shape) @ size)[:, :2]
+    torch.testing.assert_close(linear[seen], moved[:, :2][seen], rtol=1e-3, atol=1e-11)
+    assert float(linear[seen].abs().median()) > 1e-8
+    about: dict[str, Any] = {"mechanism": "instrument", "mechanism_keys": keys, "records": str(tmp_path / "rows.csv")}
+    found = identify(**about, seed=0).results
+    assert all(0.6 < found["constraint"]["readings"][n]["noise"] / 1e-5 < 1.4 for n in ("distance", "z"))
+    position = calibrate(RunConfig.from_keys(**about, geometry="identify", effects="none")).results.pose.position
+    before, after = position.before.rms.median, position.after.rms.median
+    assert before is not None and after is not None and after < 0.1 * before

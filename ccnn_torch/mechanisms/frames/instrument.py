@@ -266,7 +266,9 @@ class Instrument(Seen):
         second = self._second()
         if second is None:
             return [joints]
-        return [joints, (self.home_pose if rows is None else rows)[..., second].expand_as(joints)]
+        there = (self.home_pose if rows is None else rows)[..., second].expand_as(joints)
+        # A row without a second place shows nothing of it.
+        return [joints, torch.where(there.isnan(), joints, there)]
 
     def with_second(self, rows: Tensor, joints: Tensor) -> Tensor:
         """Rows `... x p` with other joints `... x n` of the second place."""
