@@ -139,11 +139,3 @@ def test_where_geometry_has_no_place() -> None:
         RunConfig.from_keys(case="tripod", geometry="identify")
     with pytest.raises(InputError, match="geometry"):
         RunConfig.from_keys(**UR10, geometry="identfy")
-
-
-def test_an_arm_with_frames_per_group_is_refused(tmp_path: Path) -> None:
-    text = (DATA / "ur10.yaml").read_text()
-    (tmp_path / "arm.yaml").write_text(text + "\nframe_per: [goal_x]\n")
-    keys = {**UR10, "mechanism": str(tmp_path / "arm.yaml"), "geometry": "identify"}
-    with pytest.raises(InputError, match=r"geometry: .* has frames per group"):
-        prepare(RunConfig.from_keys(**keys))

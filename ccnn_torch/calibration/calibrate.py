@@ -70,6 +70,8 @@ class Calibration:
     def _framed(prepared: Prepared, repeat: int) -> Mechanism:
         parameters = prepared.repeat_parameters(repeat)
         mechanism = prepared.mechanism
+        if mechanism.grouped and prepared.physics is not None:
+            return prepared.physics.in_own_base(repeat, torch.nonzero(prepared.physics.rows[repeat])[:, 0])[0].mechanism
         if isinstance(mechanism, Seen):
             parameters, mechanism = mechanism.inner_values(parameters), mechanism.mechanism
         return mechanism if parameters is None else mechanism.with_nominal(parameters)

@@ -12,7 +12,7 @@ from ccnn_torch.calibration.learning.fitting import Fitted
 from ccnn_torch.calibration.rows.prepare import Prepared
 from ccnn_torch.compensation import Compensator
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.mechanisms import PoseError, Seen
+from ccnn_torch.mechanisms import Instrument, PoseError, Seen
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
@@ -115,7 +115,7 @@ def _of_records(
         places = [(q, _covariates(prepared, k, found, ending)) for q, ending in visited]
         with torch.no_grad():
             learned = [q + (found[k].learned(q, c) if found else deviation[k]) for q, c in places]
-        rest = _apart(measured, _model(prepared, k, *learned))
+        rest = _apart(prepared, measured, _model(prepared, k, *learned))
         left.append(rest)
         if not found:
             reached.append(rest)
@@ -127,9 +127,9 @@ def _of_records(
         about = (_wanted(prepared, k), None if given is None else given[k])
         nominal = prepared.mechanism.forward_kinematics(joints, *about)
         wanted = _vectors(prepared, nominal)
-        reached.append(_apart(_model(prepared, k, *moved), wanted) + rest)
+        reached.append(_apart(prepared, _model(prepared, k, *moved), wanted) + rest)
         damped += float((solved[0].status == 3).double().mean()) / len(prepared.joints)
-    explained, after = _error(torch.stack(left)), _error(torch.stack(reached))
+    explained, after = (_error(prepared, torch.stack(each)) for each in (left, reached))
     return Outcome(fitted, deviation, score, explained, after, None, tuple(found), without, damped)
 
 
@@ -138,10 +138,10 @@ def pose_with_effects(prepared: Prepared) -> PoseError | None:
     if prepared.physics is None or not prepared.physics.source:
         return None
     rows = [
-        _apart(_vectors(prepared, prepared.pose[k]), _model(prepared, k, *_places(prepared, k)))
+        _apart(prepared, _vectors(prepared, prepared.pose[k]), _model(prepared, k, *_places(prepared, k)))
         for k in range(len(prepared.joints))
     ]
-    return _error(torch.stack(rows))
+    return _error(prepared, torch.stack(rows))
 
 
 def _parameters(prepared: Prepared, repeat: int) -> Tensor | None:
@@ -155,9 +155,15 @@ def _given(prepared: Prepared) -> Tensor | None:
 
 
 def _wanted(prepared: Prepared, repeat: int) -> Tensor | None:
-    """The same as the model's instrument shows it: a focal length is no error of the machine."""
+    """The same as the model's instrument shows it, in its set-up: a focal length is no error of the machine."""
     nominal, mechanism = _parameters(prepared, repeat), prepared.mechanism
-    if nominal is None or prepared.physics is None or not isinstance(mechanism, Seen):
+    if nominal is None or prepared.physics is None:
+        return nominal
+    if mechanism.grouped:
+        of_set_ups = ("base_",) * bool(mechanism.frame_per) + ("tool_",) * bool(mechanism.tool_per)
+        own = torch.tensor([p.name.startswith(of_set_ups) for p in mechanism.geometry])
+        return torch.where(own, prepared.physics.values[repeat], nominal)
+    if not isinstance(mechanism, Seen):
         return nominal
     inner = len(mechanism.mechanism.geometry)
     own = prepared.physics.values[repeat, :, inner:]
@@ -182,7 +188,9 @@ def _model(prepared: Prepared, repeat: int, moved: Tensor, *second: Tensor) -> T
     if prepared.physics is not None:
         return prepared.physics.frames(repeat, moved, *second)
     guess = completed(prepared.mechanism, moved, prepared.pose[repeat], _parameters(prepared, repeat))
-    guess = torch.cat([guess[..., : prepared.mechanism.compared], *second], -1) if second else guess
+    if second:
+        assert isinstance(prepared.mechanism, Instrument)
+        guess = prepared.mechanism.with_second(guess, second[0])
     return _vectors(prepared, prepared.mechanism.forward_kinematics(moved, _parameters(prepared, repeat), guess))
 
 
@@ -192,17 +200,17 @@ def _vectors(prepared: Prepared, pose: Tensor) -> Tensor:
     return position if rotation is None else torch.cat([position, matrix_to_rotation_vector(rotation)], -1)
 
 
-def _apart(there: Tensor, here: Tensor) -> Tensor:
+def _apart(prepared: Prepared, there: Tensor, here: Tensor) -> Tensor:
     """From one frame to another, `s x c`: difference of the positions, and the rotation vector between them."""
-    shift = there[..., :3] - here[..., :3]
-    if there.shape[-1] == 3:
-        return shift
-    first, last = (rotation_vector_to_matrix(v[..., 3:]) for v in (here, there))
-    return torch.cat([shift, matrix_to_rotation_vector(last @ first.mT)], -1)
+    if prepared.mechanism.frame(prepared.mechanism.home_pose)[1] is None:
+        return there - here
+    first, last = (rotation_vector_to_matrix(v[..., -3:]) for v in (here, there))
+    return torch.cat([there[..., :-3] - here[..., :-3], matrix_to_rotation_vector(last @ first.mT)], -1)
 
 
-def _error(apart: Tensor) -> PoseError:
+def _error(prepared: Prepared, apart: Tensor) -> PoseError:
     """Of what was measured; NaN where nothing of the kind was."""
-    parts = [apart[..., :3], apart[..., 3:]] if apart.shape[-1] == 6 else [apart]
+    turns = torch.tensor([c.unit == "rad" for c in prepared.mechanism.channels])
+    parts = [apart[..., ~turns], *([apart[..., turns]] if bool(turns.any()) else [])]
     sizes = [torch.where(p.isnan().all(-1), torch.nan, p.nan_to_num().norm(dim=-1)) for p in parts]
     return PoseError(sizes[0], sizes[1] if len(sizes) == 2 else None)

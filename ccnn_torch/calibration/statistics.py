@@ -186,6 +186,9 @@ def pose_block(
     if rotation_weight is None:
         return Pose(position=position, rotation=rotation)
     first, last = (_array(p) + rotation_weight * _array(r) for p, r in ((before[0], before[1]), (after[0], after[1])))
+    if bool(np.isnan(first).all(1).any()):
+        # No row shows lengths and angles alike.
+        return Pose(position=position, rotation=rotation)
     energy = Energy(**figures("m", {"before": first, "after": last}), rotation_weight=rotation_weight)
     return Pose(position=position, rotation=rotation, energy=energy)
 

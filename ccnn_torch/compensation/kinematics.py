@@ -264,6 +264,7 @@ class Links(nn.Module):
     _slides: Tensor
     _turns: Tensor
     _coupled: Tensor | None
+    _own: Tensor | None
 
     def __init__(self, arm: Mechanism) -> None:
         super().__init__()
@@ -271,19 +272,26 @@ class Links(nn.Module):
         self._turned = arm.orientation == "rotation_vector"
         links = _links(arm)
         spins, shifts = _screws(links)
+        curved = arm.own_drives.curved
         for name, value in {
             "_links": links,
             "_spins": spins,
             "_shifts": shifts,
             "_slides": (~arm.revolute).to(torch.float64),
             "_turns": arm.revolute.to(torch.float64),
-            "_coupled": arm.coupled(arm.nominal),
+            "_coupled": None if curved else arm.coupled(arm.home_joints, arm.nominal),
+            "_own": arm.of_drives(arm.nominal) if curved else None,
         }.items():
             self.register_buffer(name, value, persistent=False)
+        self._drives = arm.own_drives
 
     def at(self, joints: Tensor) -> Placed:
         """At joints `... x n` [SI]."""
-        joints = joints if self._coupled is None else joints @ self._coupled.mT
+        coupled = self._coupled
+        if self._own is not None:
+            coupled, joints = self._drives.coupled(joints, self._own), self._drives.moved(joints, self._own)
+        elif coupled is not None:
+            joints = joints @ coupled.mT
         turned, other = torch.cos(joints) * self._turns, torch.sin(joints) * self._turns + joints * self._slides
         moved = turned[..., None, None] * self._links[0] + other[..., None, None] * self._links[1] + self._links[2]
         chain = [moved[..., 0, :, :]]
@@ -294,8 +302,8 @@ class Links(nn.Module):
         spins = (rotations @ self._spins)[..., 0]
         linear = (rotations @ self._shifts)[..., 0] + cross(spins, lever)
         rotation = chain[-1][..., :3, :3] if self._turned else None
-        if self._coupled is not None:
-            linear, spins = self._coupled.mT @ linear, self._coupled.mT @ spins
+        if coupled is not None:
+            linear, spins = coupled.mT @ linear, coupled.mT @ spins
         return Placed(chain[-1][..., :3, 3], rotation, linear, spins)
 
 

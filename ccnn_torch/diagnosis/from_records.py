@@ -18,7 +18,6 @@ from ccnn_torch.diagnosis.from_file import (
     TRAINING_ROWS,
     Verdict,
     in_time,
-    one_row_at_a_time,
     usable_verdict,
     with_numbers,
 )
@@ -53,10 +52,8 @@ from ccnn_torch.records.covariates import DEFAULT_COVARIATES
 from ccnn_torch.records.load import FILE, is_frame
 from ccnn_torch.records.read_table import Frame
 
-_POSITION = {"x": 0, "y": 1, "z": 2}
 # Names that a note lists.
 _FEW_NAMES = 6
-_TURN = {"rx": 3, "ry": 4, "rz": 5}
 
 
 def diagnose(
@@ -125,7 +122,11 @@ def _word(situation: Situation) -> str:
 
 def _instrument(records: Records, situation: Situation) -> Noise | None:
     names = [c.name for c in situation.mechanism.pose]
-    return noise_of_columns(records, names, {**_POSITION, **_TURN}, situation.jacobian.shape[-2])
+    return noise_of_columns(records, names, _numbers_of_channels(situation), situation.jacobian.shape[-2])
+
+
+def _numbers_of_channels(situation: Situation) -> dict[str, int]:
+    return {c.name: k for k, c in enumerate(situation.mechanism.channels)}
 
 
 def _unread(records: Records, situation: Situation, said: Diagnosis) -> list[str]:
@@ -221,7 +222,6 @@ def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) ->
     """
     if noise is None:
         return None
-    count = situation.jacobian.shape[-2]
     pose, measured = situation.mechanism.pose, situation.mechanism.pose[: situation.mechanism.compared]
     names = [c.name for c in measured]
     if isinstance(noise, str):
@@ -250,12 +250,9 @@ def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) ->
         )
     lengths = [noise[c.name] for c in measured if c.unit == "m"]
     angles = [noise[c.name] for c in measured if c.unit != "m"]
-    values = [max(lengths, default=1.0)] * 3 + [max(angles, default=1.0)] * 3
-    for name, value in noise.items():
-        channel = {**_POSITION, **_TURN}.get(name)
-        if channel is not None:
-            values[channel] = float(value)
-    return torch.tensor(values[:count], dtype=torch.float64)
+    largest = {"m": max(lengths, default=1.0), "rad": max(angles, default=1.0)}
+    values = [float(noise.get(c.name, largest[c.unit])) for c in situation.mechanism.channels]
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def named_machine(said: Diagnosis) -> dict[str, Any] | None:
@@ -280,7 +277,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         verdict = usable_verdict(whole, recorded)[0]
         if verdict is None and drift is None:
             return None
-        situation = one_row_at_a_time(recorded) if grouped else on_fitted_frames(recorded)
+        situation = on_fitted_frames(recorded)
         identify = any(a.effect.kind == "parameters" for a in said.acting)
         if identify and isinstance(arm, SerialArm):
             situation = _in_link_frames(situation)
@@ -295,7 +292,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         acting, values = fit_jointly(situation, analysis.measured, known, fine, loose)
         acting = [a for a in acting if not _is_beside(a)]
         if grouped:
-            situation, values = _in_own_base(situation, values[0])
+            situation, values = in_own_base(situation, values[0])
         used = used_covariates(situation, acting)
         situation = replace(situation, covariates={n: v for n, v in situation.covariates.items() if n in used})
         if isinstance(situation.mechanism, Instrument):
@@ -325,8 +322,13 @@ def _in_link_frames(situation: Situation) -> Situation:
     return replace(situation, mechanism=six, parameters=parameters)
 
 
-def _in_own_base(situation: Situation, values: Tensor) -> tuple[Situation, Tensor]:
-    """A machine of which groups of rows have base frames, without these, and its parameters so; values: of one."""
+def in_own_base(situation: Situation, values: Tensor) -> tuple[Situation, Tensor]:
+    """A machine of which groups of rows have frames, in its own base, and its parameters so.
+
+    Where groups have tools, the tool is that of the first row, as it is: what it was taken for is no error.
+
+    values: of one row, the first.
+    """
     machine, parameters = situation.mechanism, situation.parameters
     assert parameters is not None
     none = torch.zeros(6, dtype=values.dtype)
@@ -336,9 +338,13 @@ def _in_own_base(situation: Situation, values: Tensor) -> tuple[Situation, Tenso
     else:
         assert isinstance(machine, Framed)
         one = Framed(machine.mechanism, True, machine.tool, machine.rotation_weight)
-    alone = one.with_nominal(torch.cat([none, parameters[0, 6:]]))
-    down = rotation_vector_to_matrix(parameters[0, 3:6]).mT @ situation.gravity
-    return replace(situation, mechanism=alone, parameters=None, gravity=down), torch.cat([none, values[6:]])
+    base = 6 if isinstance(machine, SerialArm) or machine.base else 0
+    nominal = torch.cat([parameters[0, base:-6], values[-6:]]) if machine.tool_per else parameters[0, base:]
+    alone = one.with_nominal(torch.cat([none, nominal]))
+    down = situation.gravity
+    if base:
+        down = rotation_vector_to_matrix(parameters[0, 3:6]).mT @ down
+    return replace(situation, mechanism=alone, parameters=None, gravity=down), torch.cat([none, values[base:]])
 
 
 def _numbers(acting: Acting, said: Diagnosis) -> dict[str, float]:

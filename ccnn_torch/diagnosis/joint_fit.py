@@ -112,8 +112,11 @@ def effects_that_pay(
 
 
 def on_fitted_frames(situation: Situation) -> Situation:
-    """The same rows on a machine whose nominal parameters are the situation's, each as if it were isolated."""
-    if situation.parameters is not None:
+    """The same rows on a machine whose nominal parameters are the situation's, each as if it were isolated.
+
+    Frames that groups of rows have for themselves stay parameters by row.
+    """
+    if situation.parameters is not None and situation.parameters.dim() == 1:
         mechanism = situation.mechanism.with_nominal(situation.parameters)
         situation = replace(situation, mechanism=mechanism, parameters=None)
     return one_row_at_a_time(situation)
@@ -157,7 +160,11 @@ class _Model:
 
     def begin(self, parameters: Tensor) -> Tensor:
         """The vector of a machine without effects."""
-        change = (parameters - self.nominal)[self.loose] / self.sizes[-1]
+        # Each column is of one parameter, in all rows or in those of a group.
+        spread, change = self.spread.reshape(-1, *self.spread.shape[-2:]), parameters - self.nominal
+        change = (
+            (spread * change.expand(spread.shape[:-1])[..., None]).sum((0, 1)) / spread.sum((0, 1)) / self.sizes[-1]
+        )
         return torch.cat([change.new_zeros(self.size - len(change)), change])
 
     def acting(self, at: Tensor) -> list[Acting]:
@@ -245,7 +252,9 @@ class _Rows:
         """Noise from the richest fit; rows that only all effects together explain count as yet."""
         here = self.model.situation
         columns, channels = [self.columns[..., g] for g in self.groups], moving_channels(here)
-        white = fitted_whitening(self.target, columns, channels, None, self.fine, self.seen, device_axes(here))
+        white = fitted_whitening(
+            self.target, columns, channels, None, self.fine, self.seen, device_axes(here), here.mechanism.channels
+        )
         left = white.picked(self.left) / white.sigma
         near = inlying(left.norm(dim=-1), self.fine, len(white.channels), 0)
         return replace(white, weight=(self.fine & near)[:, None].expand_as(left).to(left.dtype))

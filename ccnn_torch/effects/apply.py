@@ -76,7 +76,8 @@ def reached(situation: Situation, acting: Sequence[Acting], parameters: Tensor |
             at is that of the situation.
 
     Returns:
-        The frame's position and rotation vector side by side, `... x s x c`: c = 3 without orientation, else 6.
+        The frame's position and rotation vector side by side, `... x s x c`: c = 3 without orientation, else 6; of
+        instruments as many as there are readings.
     """
     there = moved(situation, acting, parameters)
     position, rotation = situation.mechanism.frame(
@@ -85,9 +86,9 @@ def reached(situation: Situation, acting: Sequence[Acting], parameters: Tensor |
     for one in acting:
         for place in situation.places if one.effect.kind == "pose" else ():
             change = one.change(place)
-            position = position + change[..., :3]
+            position = position + change[..., : position.shape[-1]]
             if rotation is not None:
-                rotation = rotation_vector_to_matrix(change[..., 3:]) @ rotation
+                rotation = rotation_vector_to_matrix(change[..., -3:]) @ rotation
     if rotation is None:
         return position
     return torch.cat([position, matrix_to_rotation_vector(rotation)], -1)
@@ -128,9 +129,9 @@ def without_pose_effects(situation: Situation, measured: Tensor, acting: Sequenc
         return measured
     position, rotation = situation.mechanism.frame(measured)
     for change in reversed(changes):
-        position = position - change[..., :3]
-        if rotation is not None and change.shape[-1] == 6:
-            rotation = rotation_vector_to_matrix(change[..., 3:]).mT @ rotation
+        position = position - change[..., : position.shape[-1]]
+        if rotation is not None:
+            rotation = rotation_vector_to_matrix(change[..., -3:]).mT @ rotation
     frame = position if rotation is None else torch.cat([position, matrix_to_rotation_vector(rotation)], -1)
     found = measured_pose(situation, torch.nan_to_num(frame))
     fine = torch.isfinite(frame).all(-1, keepdim=True) & torch.isfinite(found).all(-1, keepdim=True)
@@ -150,8 +151,9 @@ def measured_pose(situation: Situation, frame: Tensor) -> Tensor:
     mechanism = situation.mechanism
     if mechanism.orientations:
         return frame
-    position = frame[..., :3]
-    rotation = rotation_vector_to_matrix(frame[..., 3:]) if frame.shape[-1] == 6 else None
+    turns = mechanism.frame(mechanism.home_pose)[1] is not None
+    position = frame[..., :-3] if turns else frame
+    rotation = rotation_vector_to_matrix(frame[..., -3:]) if turns else None
     pose = situation.pose.expand(*frame.shape[:-1], -1)
     for _ in range(_ROUNDS):
         there = mechanism.frame(pose)

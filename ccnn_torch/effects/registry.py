@@ -140,7 +140,7 @@ class OwnEffect:
         if self.kind == "parameters":
             return "parameters", len(mechanism.geometry)
         # Not by the situation's Jacobian, which may be slow, or recorded as something that the effect reads.
-        return "pose channels", 3 if mechanism.frame(mechanism.home_pose)[1] is None else 6
+        return "pose channels", len(mechanism.channels)
 
     def _not_finite(self, situation: Situation, shape: Tensor, found: Tensor) -> str:
         if bool(torch.isfinite(found).all()):

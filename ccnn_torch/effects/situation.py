@@ -79,9 +79,11 @@ class Situation:
         joints = self.mechanism.places(self.joints, self.guess)
         if len(joints) == 1:
             return [self]
-        turned = torch.cat([self.pose[..., : self.mechanism.compared], self.joints], -1)
+        assert isinstance(self.mechanism, Instrument)
+        turned = self.mechanism.with_second(self.pose, self.joints)
         covariates = {n: self.covariates.get(f"{n}{SECOND}", v) for n, v in self.covariates.items()}
-        return [self, replace(self, joints=joints[1], guess=turned, covariates=covariates)]
+        other = self.mechanism.elsewhere()
+        return [self, replace(self, mechanism=other, joints=joints[1], guess=turned, covariates=covariates)]
 
     @cached_property
     def visits(self) -> Situation:
@@ -94,7 +96,10 @@ class Situation:
 
     def moved(self, joints: Sequence[Tensor], parameters: Tensor | None) -> Situation:
         """The rows with other joints at each of their places, `... x s x n` [SI], and other parameters."""
-        guess = torch.cat([self.pose[..., : self.mechanism.compared], *joints[1:]], -1) if joints[1:] else self.pose
+        guess = self.pose
+        if joints[1:]:
+            assert isinstance(self.mechanism, Instrument)
+            guess = self.mechanism.with_second(guess, joints[1])
         return replace(self, joints=joints[0], parameters=parameters, guess=guess)
 
     @cached_property

@@ -276,7 +276,10 @@ class IdentifyConfig(JobConfig):
             "residual": (self.residual != "auto", "has a residual of its own; remove the key"),
             "per_leg": (self.per_leg, "depends on all legs; remove the key"),
             "frame.base": (self.frame.base, "has no known place and cannot determine the base frame; remove the key"),
-            "noise": (isinstance(self.noise, dict), "has one noise; write one size, e.g. noise='0.02 mm'"),
+            "noise": (
+                isinstance(self.noise, dict) and constraint.kind != "pose",
+                "has one noise; write one size, e.g. noise='0.02 mm'",
+            ),
             "joint_noise": (self.joint_noise is not None, "has one noise, that of the whole; remove the key"),
             "transfer": (self.transfer is not None, "has no measured poses to transfer to; remove the key"),
             "bootstrap": (self.bootstrap > 0, "has the formula's intervals alone; remove the key"),

@@ -46,8 +46,8 @@ from ccnn_torch.identification.problems.problem import joined
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
 from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, PoseError, SerialArm
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.mechanisms.frames.instrument import instrument
-from ccnn_torch.mechanisms.frames.readings import READINGS
 from ccnn_torch.records.commanded import read_joints
 from ccnn_torch.records.load import read_source
 
@@ -57,17 +57,20 @@ _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
 _TOOL_TOLERANCE, _PLATE_TOLERANCE = 0.05, 1e-4
 _LINK_TOLERANCE = {"m": 1e-3, "rad": 1e-2}
 
-Build = Callable[[ParameterChoice, Tensor, float | None], Problem]
+Build = Callable[[ParameterChoice, Tensor, float | Mapping[str, float] | None], Problem]
 
 
 @dataclass(frozen=True)
 class State:
-    """A geometry `K` [SI] with the problem and its values `1 x p` [SI] that it came from; noise [m], 1 if unknown."""
+    """A geometry `K` [SI] with the problem and its values `1 x p` [SI] that it came from.
+
+    noise: of each of the problem's channels, `c` [SI]; 1 if unknown.
+    """
 
     geometry: Tensor
     problem: Problem
     values: Tensor
-    noise: float
+    noise: Tensor
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,7 @@ class ConstraintFit:
         knowledge: of all the problem's parameters.
         fit: the last round's.
         beside: of rows of other kinds, one each.
+        readings: of each reading where they have noise of their own, by name.
     """
 
     before: State
@@ -89,18 +93,56 @@ class ConstraintFit:
     knowledge: Knowledge
     fit: Fit
     beside: list[dict[str, Any]]
+    readings: dict[str, dict[str, Any]]
 
 
 @dataclass
 class _Source:
-    """Rows of one kind: what makes their problem, and the noise of an equation, as given or of the last round."""
+    """Rows of one kind: what makes their problem, and the noise of an equation, as given or of the last round.
+
+    Attributes:
+        noise: of each group of channels that have one, `g` [SI].
+        known: which of these were given, `g` bool.
+        group: of each channel, by its name; {} where all have one.
+    """
 
     build: Build
-    noise: float
-    known: bool
+    rows: ConstraintRows
+    noise: Tensor
+    known: Tensor
+    group: Mapping[str, int]
 
     def problem(self, choice: ParameterChoice, start: Tensor) -> Problem:
-        return self.build(choice, start, self.noise)
+        return self.build(choice, start, self.sizes)
+
+    @property
+    def sizes(self) -> float | dict[str, float]:
+        """As `forward_problem` takes them."""
+        values = self.noise.tolist()
+        return {name: values[i] for name, i in self.group.items()} if self.group else float(values[0])
+
+    def left(self, problem: Problem, values: Tensor) -> Tensor:
+        """Root mean square of the residuals of the rows with weight, `g` [SI]."""
+        group = torch.tensor([self.group.get(channel.name, 0) for channel in problem.channels])
+        inside = torch.nn.functional.one_hot(group, len(self.noise)).double()
+        square, seen = _residual(problem, values)[0].square(), self.rows.measured([c.name for c in problem.channels])
+        used = problem.weights[0] > 0
+        square, count = (each[used].double().sum(0) @ inside for each in (square, seen))
+        return (self.noise * (square / count.clamp_min(1)).sqrt()).clamp_min(_LEAST_NOISE)
+
+    def told(self, problem: Problem, values: Tensor) -> dict[str, float]:
+        """What it leaves and the noise, of the first group [SI]."""
+        left = self.left(problem, problem.start), self.left(problem, values)
+        return {"noise": float(self.noise[0]), "before": float(left[0][0]), "after": float(left[1][0])}
+
+    def sd(self, problem: Problem) -> Tensor:
+        """Noise of each of the problem's channels, `c` [SI]."""
+        seen, sizes = self.rows.seen, self.sizes
+        if seen is None or isinstance(sizes, dict):
+            each = [sizes[c.name] if isinstance(sizes, dict) else sizes for c in problem.channels]
+            return torch.tensor(each, dtype=torch.float64)
+        every = dict(zip((c.name for c in seen.pose), sizes_of_pose(sizes, seen.pose, "noise").tolist(), strict=True))
+        return torch.tensor([every[c.name] for c in problem.channels], dtype=torch.float64)
 
 
 def fit_constraint(
@@ -108,8 +150,7 @@ def fit_constraint(
     mechanism: Mechanism,
     rows: ConstraintRows,
     progress: Progress | None = None,
-    others: Sequence[Build] = (),
-    units: Sequence[str] = (),
+    others: Sequence[tuple[Build, ConstraintRows]] = (),
 ) -> ConstraintFit:
     """Fit the rows that have weight.
 
@@ -118,8 +159,7 @@ def fit_constraint(
     equations that the fit used up.
 
     Args:
-        others: of the rows of other kinds, in the order of the config.
-        units: of their equations.
+        others: what makes the problem of the rows of each other kind, and these, in the order of the config.
     """
     assert config.constraint is not None
     build = _builder(config.constraint, mechanism, rows)
@@ -132,15 +172,13 @@ def fit_constraint(
     of_machine = [n for group in free.groups for n in group]
     tool = [] if isinstance(mechanism, Instrument) else [n for n in of_machine if n.startswith("tool_")]
     choice = ParameterChoice(of_machine, (), about.tied, {**_priors(config, mechanism, of_machine), **about.prior})
-    before = _tool_first(mechanism, build, tool, choice)
+    before = _tool_first(mechanism, rows, build, tool, choice)
     solver = solver_of("lm", config)
     given = [(config.noise, "noise")]
     given += [(one.noise, f"constraint.beside.{i}.noise") for i, one in enumerate(config.constraint.beside)]
-    units = ["rad" if _angles_alone(rows) else "m", *units]
-    sources = [
-        _source(make, noise, unit, key) for make, unit, (noise, key) in zip((build, *others), units, given, strict=True)
-    ]
-    rounds = 1 if all(s.known for s in sources) else _ROUNDS
+    every = [(build, rows), *others]
+    sources = [_source(make, own, noise, key) for (make, own), (noise, key) in zip(every, given, strict=True)]
+    rounds = 1 if all(bool(s.known.all()) for s in sources) else _ROUNDS
     selection = select_parameters(mechanism.geometry, choice, before.geometry)
     shared = len(selection.parameters)
     loss = config.robust or "squared"
@@ -149,7 +187,7 @@ def fit_constraint(
         fit = solver(_all_of(parts, shared), config.seed)
         values = _values_of(parts, fit.values, shared)
         for source, part, own in zip(sources, parts, values, strict=True):
-            source.noise = source.noise if source.known else _left(part, own, source.noise)
+            source.noise = torch.where(source.known, source.noise, source.left(part, own))
         if progress is not None:
             progress((done + 1) / rounds)
     if rounds > 1:
@@ -157,23 +195,57 @@ def fit_constraint(
         whole = _all_of(parts, shared)
         spared = float(what_is_known(reweighted(whole, fit.values, loss), fit.values).noise)
         for source in sources:
-            source.noise *= max(1.0, spared) if spared < float("inf") and not source.known else 1.0
+            more = max(1.0, spared) if spared < float("inf") else 1.0
+            source.noise = torch.where(source.known, source.noise, source.noise * more)
         parts = [s.problem(choice, before.geometry) for s in sources]
     whole = _all_of(parts, shared)
-    after = State(selection.full(fit.values[:, :shared])[0], parts[0], values[0], sources[0].noise)
+    after = State(selection.full(fit.values[:, :shared])[0], parts[0], values[0], sources[0].sd(parts[0]))
     known = what_is_known(reweighted(whole, fit.values, loss), fit.values)
-    beside = [
-        {"noise": s.noise, "before": _left(p, p.start, s.noise), "after": _left(p, own, s.noise)}
-        for s, p, own in zip(sources[1:], parts[1:], values[1:], strict=True)
-    ]
-    return ConstraintFit(before, after, selection, known, fit, beside)
+    beside = [s.told(p, own) for s, p, own in zip(sources[1:], parts[1:], values[1:], strict=True)]
+    return ConstraintFit(before, after, selection, known, fit, beside, _readings(sources[0], parts[0], values[0]))
 
 
-def _source(build: Build, noise: Any, unit: str, key: str) -> _Source:
-    known = None if noise is None or isinstance(noise, dict) else size(noise, unit, key)
-    if known is not None and not known > 0:
-        raise InputError(f"{key}: {known:g} is no standard deviation; write a size above 0, or remove the key")
-    return _Source(build, known or _FIRST_NOISE, known is not None)
+def _source(build: Build, rows: ConstraintRows, noise: Any, key: str) -> _Source:
+    """Rows with the noise that is given: one for all, or by name; readings of an instrument in one unit share one."""
+    read = [] if rows.seen is None else [*rows.seen.pose[: rows.seen.compared]]
+    numbers = rows.seen.noise_groups() if isinstance(rows.seen, Instrument) else [0] * len(read)
+    values = torch.full((max(len(read), 1),), math.nan, dtype=torch.float64)
+    if isinstance(noise, dict):
+        values = sizes_by_name(noise, read, key, values.tolist())
+        # What is given by name is of that alone.
+        numbers = [n if math.isnan(v) else len(read) + k for k, (n, v) in enumerate(zip(numbers, values, strict=True))]
+    elif noise is not None:
+        unit = "rad" if _angles_alone(rows) else "m"
+        values = torch.full_like(values, size(noise, unit, key))
+        values = sizes_of_pose(noise, read, key) if len({*numbers}) > 1 else values
+    if bool((values <= 0).any()):
+        least = float(values[values <= 0][0])
+        raise InputError(f"{key}: {least:g} is no standard deviation; write a size above 0, or remove the key")
+    every = sorted({*numbers}) or [0]
+    first = [numbers.index(n) if numbers else 0 for n in every]
+    group = {c.name: every.index(n) for c, n in zip(read, numbers, strict=True)} if len(every) > 1 else {}
+    known = ~values[first].isnan()
+    return _Source(build, rows, torch.where(known, values[first], _FIRST_NOISE), known, group)
+
+
+def _readings(source: _Source, problem: Problem, values: Tensor) -> dict[str, dict[str, Any]]:
+    """What was read by name where noise is by reading: unit, rows, noise, and RMS before and after [SI]."""
+    if not source.group or source.rows.seen is None:
+        return {}
+    units = {c.name: c.unit for c in source.rows.seen.pose}
+    before, after = source.left(problem, problem.start), source.left(problem, values)
+    counts = source.rows.measured([*source.group]).sum(0).tolist()
+    return {
+        name: {
+            "unit": units[name],
+            "rows": int(rows),
+            "noise": float(source.noise[i]),
+            "noise_known": bool(source.known[i]),
+            "before": float(before[i]),
+            "after": float(after[i]),
+        }
+        for (name, i), rows in zip(source.group.items(), counts, strict=True)
+    }
 
 
 def _all_of(parts: Sequence[Problem], shared: int) -> Problem:
@@ -186,22 +258,23 @@ def _values_of(parts: Sequence[Problem], values: Tensor, shared: int) -> list[Te
     return [torch.cat([values[:, :shared], values[:, a:b]], -1) for a, b in pairwise(ends)]
 
 
-def held_distance(mechanism: Mechanism, rows: ConstraintRows, state: State) -> Tensor:
-    """How far each row's tool is from where the constraint holds it, `s` [m].
+def _held_error(mechanism: Mechanism, rows: ConstraintRows, state: State, held: Tensor) -> PoseError:
+    """How far the tool of the held-out rows is from where the constraint holds it, `1 x t`; NaN of what was not read.
 
     In a socket: from the mean of the points that the rows with weight put into the same socket of the same placement,
-    which needs no fitted plate. Else |residual| of the distance or height, with the anchor or plane of the fit.
+    which needs no fitted plate. Else |residual| of what was read, of lengths and of angles.
     """
-    if rows.in_sockets:
-        return scatter(tool_points(mechanism, rows.joints, state.geometry), rows.cell, rows.weights)
-    far: Tensor = _residual(state.problem, state.values)[0].norm(dim=-1) * state.noise
-    return far
-
-
-def _held_error(mechanism: Mechanism, rows: ConstraintRows, state: State, held: Tensor) -> PoseError:
-    """Of the held-out rows, `1 x t`, as an angle where only angles were measured."""
-    far = held_distance(mechanism, rows, state)[None, held]
-    return PoseError(torch.zeros_like(far), far) if _angles_alone(rows) else PoseError(far, None)
+    if rows.seen is None:
+        far = scatter(tool_points(mechanism, rows.joints, state.geometry), rows.cell, rows.weights)
+        return PoseError(far[None, held], None)
+    names, left = [c.name for c in state.problem.channels], _residual(state.problem, state.values)[0] * state.noise
+    units, seen = {c.name: c.unit for c in rows.seen.pose}, rows.measured(names)
+    parts = []
+    for unit in ("m", "rad"):
+        mine = [k for k, name in enumerate(names) if units[name] == unit]
+        far = left[:, mine].norm(dim=-1)
+        parts.append((torch.where(seen[:, mine].any(-1), far, math.nan) if mine else far)[None, held])
+    return PoseError(parts[0], parts[1] if "rad" in units.values() else None)
 
 
 def _angles_alone(rows: ConstraintRows) -> bool:
@@ -215,7 +288,7 @@ def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
         if isinstance(about, ConstraintConfig) and about.plate_tolerance is not None:
             plate = size(about.plate_tolerance, "m", "constraint.plate_tolerance")
 
-        def sockets(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
+        def sockets(choice: ParameterChoice, start: Tensor, noise: Any) -> Problem:
             # Without noise there is nothing to weigh the plate's scale against.
             scale = 0.0 if noise is None else plate
             return socket_problem(
@@ -231,10 +304,13 @@ def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
         assert seen is not None
         return seen
 
-    def read(choice: ParameterChoice, start: Tensor, noise: float | None) -> Problem:
+    def read(choice: ParameterChoice, start: Tensor, noise: Any) -> Problem:
         seen = at(tuple(start.tolist()))
         # What an instrument adds to the machine's parameters comes behind them.
         own = seen.geometry[len(mechanism.geometry) :]
+        if isinstance(noise, dict):
+            # What an instrument was pointed at is never compared.
+            noise = dict.fromkeys((c.name for c in seen.pose[seen.compared :]), 1.0) | noise
         sizes = None if noise is None else sizes_of_pose(noise, seen.pose, "noise")
         start = torch.cat([start, seen.nominal[len(start) :]])
         choice = replace(choice, free=[*(choice.free or ()), *(p.name for p in own)])
@@ -245,29 +321,20 @@ def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
     return read
 
 
-def _beside(config: IdentifyConfig, mechanism: Mechanism) -> tuple[list[Build], list[dict[str, Any]]]:
-    """What makes the problem of the rows of each other kind; how many rows it has, and the unit of an equation."""
+def _beside(config: IdentifyConfig, mechanism: Mechanism) -> list[tuple[Build, ConstraintRows]]:
+    """What makes the problem of the rows of each other kind, and these."""
     assert config.constraint is not None
-    found: list[Build] = []
-    told: list[dict[str, Any]] = []
+    found: list[tuple[Build, ConstraintRows]] = []
     for about in config.constraint.beside:
         if about.kind == "pose":
-            seen = mechanism if about.instrument is None else _held_by(mechanism, about.instrument)
+            seen = mechanism if about.instrument is None else instrument(mechanism, [about.instrument])
             rows = placed(poses_of(config, about.records, seen)[0])
         else:
             source = read_source(about.records, config.columns)
             table = read_joints(source, mechanism, config.joint_map, config.columns)
             rows = rows_of(table, mechanism, about)
-        found.append(_builder(about, mechanism, rows))
-        told.append({"rows": len(rows.joints), "unit": "rad" if _angles_alone(rows) else "m"})
-    return found, told
-
-
-def _held_by(mechanism: Mechanism, about: Mapping[str, Any]) -> Instrument:
-    kind, link = about.get("kind"), about.get("link")
-    if not isinstance(kind, str):
-        raise InputError(f"constraint.beside: instrument: write its kind, one of {', '.join(READINGS)}")
-    return instrument(mechanism, kind, link, {k: v for k, v in about.items() if k not in ("kind", "link")})
+        found.append((_builder(about, mechanism, rows), rows))
+    return found
 
 
 def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> dict[str, float]:
@@ -289,29 +356,37 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
     return priors | {n: _TOOL_TOLERANCE for n in free if n.startswith("tool_") and "tool" not in unknown}
 
 
-def _tool_first(mechanism: Mechanism, build: Build, tool: list[str], choice: ParameterChoice) -> State:
+def _tool_first(
+    mechanism: Mechanism, rows: ConstraintRows, build: Build, tool: list[str], choice: ParameterChoice
+) -> State:
     """The tool's offset with nominal links; where it is fixed, the constraint as its builder finds it at nominal."""
     nominal = mechanism.nominal
     if not tool:
         problem = build(choice, nominal, _FIRST_NOISE)
-        return State(nominal, problem, problem.start, _FIRST_NOISE)
+        return State(nominal, problem, problem.start, _sizes(rows, problem, _FIRST_NOISE))
     alone = ParameterChoice(free=tool)
     problem = build(alone, nominal, None)
     values = solve_lm(problem).values
     geometry = select_parameters(mechanism.geometry, alone, nominal).full(values[:, : len(tool)])[0]
-    return State(geometry, problem, values, 1.0)
+    return State(geometry, problem, values, _sizes(rows, problem, None))
+
+
+def _sizes(rows: ConstraintRows, problem: Problem, noise: float | None) -> Tensor:
+    """What the problem's channels `c` are divided by where all have one noise [m], or none [SI]."""
+    seen = rows.seen
+    if seen is None:
+        return torch.full((len(problem.channels),), 1.0 if noise is None else noise, dtype=torch.float64)
+    if noise is None:
+        sizes = torch.tensor([1 / ROTATION_WEIGHT if c.unit == "rad" else 1.0 for c in seen.pose], dtype=torch.float64)
+    else:
+        sizes = sizes_of_pose(noise, seen.pose, "noise")
+    every = dict(zip((c.name for c in seen.pose), sizes.tolist(), strict=True))
+    return torch.tensor([every[c.name] for c in problem.channels], dtype=torch.float64)
 
 
 def _residual(problem: Problem, values: Tensor) -> Tensor:
     """`1 x s x c`, of all rows."""
     return problem.residual(values[:, None], *problem.data).detach()
-
-
-def _left(problem: Problem, values: Tensor, noise: float) -> float:
-    """Root mean square of the residuals of the rows with weight [m]."""
-    square = _residual(problem, values).square().sum(-1) * problem.weights
-    count = problem.weights * (len(problem.channels) - (0 if problem.missing is None else problem.missing))
-    return max(_LEAST_NOISE, noise * math.sqrt(float(square.sum() / count.sum())))
 
 
 # An interval above this share of its prior's is the prior's. Turning machine and plates together turns the residuals,
@@ -331,15 +406,15 @@ def identify_by_constraint(
     rows = read_constraint(config, mechanism, given)
     if isinstance(mechanism, Instrument) and isinstance(rows.seen, Instrument):
         mechanism = rows.seen
-        notes += [mechanism.reading.note] if mechanism.reading.note else []
+        notes += [mechanism.note] if mechanism.note else []
     begun = time.perf_counter()
-    others, told = _beside(config, mechanism)
-    fit = fit_constraint(config, mechanism, rows, progress, others, [one["unit"] for one in told])
+    others = _beside(config, mechanism)
+    fit = fit_constraint(config, mechanism, rows, progress, others)
     held = rows.weights == 0
     before, after = (_held_error(mechanism, rows, s, held) for s in (fit.before, fit.after))
     if config.fits_again() and bool(held.any()):
         every = replace(rows, weights=torch.ones_like(rows.weights))
-        again = fit_constraint(config, mechanism, every, None, others, [one["unit"] for one in told])
+        again = fit_constraint(config, mechanism, every, None, others)
         fit = again if bool(again.fit.converged.all()) else fit
     outcome = Outcome(
         machines=torch.arange(1),
@@ -360,9 +435,10 @@ def identify_by_constraint(
         data_hash=rows.data_hash,
         notes=notes,
     )
-    noise = None if config.noise is None else fit.after.noise
+    noise = None if config.noise is None or fit.readings else float(fit.after.noise[0])
     found = Found(outcome, _known(fit), before, after)
     results, arrays = assemble(config, measured, fit.selection, {"lm": found}, noise, _only_by_prior(fit, found.known))
+    told = [{"rows": len(own.joints), "unit": "rad" if _angles_alone(own) else "m"} for _, own in others]
     results["constraint"] = _constraint(config, rows, fit, told)
     return measured, {"lm": outcome}, results, arrays
 
@@ -429,10 +505,11 @@ def _constraint(
         ],
         "unknowns": unknowns,
         "unit": "rad" if _angles_alone(rows) else "m",
-        "noise": fit.after.noise,
+        "noise": float(fit.after.noise[0]),
         "noise_known": config.noise is not None,
         "beside": [
             {"kind": about.kind, "records": str(about.records), **one, **found}
             for about, one, found in zip(config.constraint.beside, told, fit.beside, strict=True)
         ],
+        "readings": fit.readings,
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from ccnn_torch.identification.config import BesideConfig, ConstraintConfig, Ide
 from ccnn_torch.identification.measured import notes_of, split_records
 from ccnn_torch.identification.problems.constraints import tool_points
 from ccnn_torch.mechanisms import Instrument, Mechanism, as_measured, fit_unknown
+from ccnn_torch.mechanisms.frames.instrument import Part
 from ccnn_torch.mechanisms.frames.readings import Between, Dial, Reading, Wire
 from ccnn_torch.records import Records, Table, load_records, stack_columns
 from ccnn_torch.records.commanded import SECOND, read_joints
@@ -58,6 +59,13 @@ class ConstraintRows:
     def in_sockets(self) -> bool:
         """Whether what is said of a row is its socket's place."""
         return self.seen is None
+
+    def measured(self, names: Sequence[str]) -> Tensor:
+        """Which of these channels were measured in each row, `s x c` bool."""
+        if self.seen is None:
+            return torch.ones(len(self.joints), len(names), dtype=torch.bool)
+        every = [c.name for c in self.seen.pose]
+        return ~self.said[:, [every.index(name) for name in names]].isnan()
 
     @property
     def cell(self) -> Tensor:
@@ -135,7 +143,7 @@ def read_by(rows: ConstraintRows, mechanism: Mechanism, about: Kind) -> Constrai
     else:
         paired = "pairs" in rows.labels[numbers[0]]
         reading = Between(mechanism) if paired else Wire(numbers)
-    return placed(replace(rows, seen=Instrument(mechanism, reading)))
+    return placed(replace(rows, seen=Instrument(mechanism, Part(reading))))
 
 
 def _normal(points: Tensor, readings: Tensor) -> list[float]:

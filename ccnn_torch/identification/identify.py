@@ -35,7 +35,7 @@ from ccnn_torch.identification.solve import (
     select,
     solver_of,
 )
-from ccnn_torch.mechanisms import Framed, Giving, Mechanism, Seen, SetUps
+from ccnn_torch.mechanisms import Framed, Giving, Instrument, Mechanism, Seen, SetUps
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
@@ -127,7 +127,8 @@ def identify(
         return Identification(config, *identify_by_constraint(config, progress, given), given=given)
     mechanism, measured = prepare(config, given)
     plain = config.residual == "auto" and config.methods == ["lm"] and not config.bootstrap
-    if isinstance(measured.mechanism, Seen) and plain and not isinstance(config.noise, dict):
+    of_each = isinstance(config.noise, dict) and not isinstance(measured.mechanism, Instrument)
+    if isinstance(measured.mechanism, Seen) and plain and not of_each:
         # Parts of poses leave much open: links stay near nominal by priors, as beside any constraint.
         held = config.model_copy(update={"constraint": ConstraintConfig(kind="pose")})
         progress = None if watch is None else watch("lm")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.config.sizes import sizes_of_joints, sizes_of_pose
+from ccnn_torch.config.sizes import Size, sizes_by_name, sizes_of_joints, sizes_of_pose
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import force_of, torque_of
 from ccnn_torch.errors import InputError
@@ -19,6 +20,7 @@ from ccnn_torch.identification.config import PER_LEG, IdentifyConfig
 from ccnn_torch.mechanisms import (
     Framed,
     Giving,
+    Instrument,
     Mechanism,
     Seen,
     SerialArm,
@@ -210,11 +212,26 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         rows=train,
         test=test,
         start=start,
-        pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),
+        pose_noise=_pose_noise(config.noise, mechanism),
         joint_noise=joint_noise,
         data_hash=records.data_hash,
         notes=[*held_out_notes(config.split, len(split.test), split), *notes_of(records), *far],
     )
+
+
+def _pose_noise(noise: Size | dict[str, Size] | None, mechanism: Mechanism) -> Tensor | None:
+    """Standard deviation of each pose coordinate, `p` [SI]; None where some of those that instruments read has none."""
+    read, given = mechanism.pose[: mechanism.compared], len(mechanism.pose) - mechanism.compared
+    if noise is None:
+        return None
+    if isinstance(noise, dict) and isinstance(mechanism, Instrument):
+        sizes = sizes_by_name(noise, read, "noise", [math.nan] * len(read))
+        if bool(sizes.isnan().any()):
+            return None
+    else:
+        sizes = sizes_of_pose(noise, read, "noise")
+    # What an instrument was pointed at is never compared.
+    return torch.nn.functional.pad(sizes, (0, given), value=1.0)
 
 
 def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[Records, Mechanism]:

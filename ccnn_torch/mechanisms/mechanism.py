@@ -15,6 +15,7 @@ from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import branches as _branches, newton as _numeric
 from ccnn_torch.mechanisms.pose import (
+    CHANNELS,
     PoseError,
     coordinates_jacobian,
     frame_from_coordinates,
@@ -372,8 +373,7 @@ class Mechanism(nn.Module):
         Returns:
             `... x n` (or fewer, as many as the Jacobian has rows); NaN where the joints have no pose.
         """
-        jacobian = self.jacobian(joints, parameters, guess).clone()
-        jacobian[..., 3:, :] *= rotation_weight
+        jacobian = self.jacobian(joints, parameters, guess) * self.channel_weights(rotation_weight)[:, None]
         known = torch.isfinite(jacobian).all(-1).all(-1)[..., None]
         values = torch.linalg.svdvals(torch.where(known[..., None], jacobian, torch.zeros_like(jacobian)))
         return torch.where(known, values, torch.nan)
@@ -386,6 +386,15 @@ class Mechanism(nn.Module):
     def grouped(self) -> bool:
         """Whether groups of rows have frames of their own."""
         return bool(self.frame_per or self.tool_per)
+
+    @property
+    def channels(self) -> tuple[Coordinate, ...]:
+        """What position and rotation vector of `frame` are, side by side, `c` of them."""
+        return CHANNELS if self.frame(self.home_pose)[1] is not None else CHANNELS[:3]
+
+    def channel_weights(self, rotation_weight: float) -> Tensor:
+        """Of angles `rotation_weight` [m/rad], of lengths 1; `c`."""
+        return self.home_pose.new_tensor([rotation_weight if c.unit == "rad" else 1.0 for c in self.channels])
 
     @property
     def compared(self) -> int:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
+from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import (
     geodesic_angle,
@@ -21,6 +22,8 @@ from ccnn_torch.numerics.rotations import (
 
 Frame = tuple[Tensor, Tensor | None]
 _LENGTHS, _TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
+CHANNELS = (*(Coordinate(c, "m") for c in _LENGTHS), *(Coordinate(c, "rad") for c in _TURNS))
+"""Position and rotation vector."""
 
 
 class PoseError(NamedTuple):
@@ -48,8 +51,8 @@ def frame_gap(there: Frame, here: Frame, rotation_weight: float) -> Tensor:
     if there[1] is None or here[1] is None:
         return shift
     turn = matrix_to_rotation_vector(there[1] @ here[1].mT)
-    shift, turn = torch.broadcast_tensors(shift, rotation_weight * turn)  # type: ignore[no-untyped-call]
-    return torch.cat([shift, turn], dim=-1)
+    lead = leading_shape(shift, turn)
+    return torch.cat([shift.expand(*lead, -1), rotation_weight * turn.expand(*lead, -1)], dim=-1)
 
 
 def frame_from_coordinates(pose: Tensor, coordinates: tuple[Coordinate, ...], name: str) -> Frame:
@@ -101,19 +104,20 @@ def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor
         position, rotation = function(x)
         return position if rotation is None else torch.cat([position, rotation.flatten(-2)], dim=-1)
 
-    value, slope = jacobian_of(flat, point, _twist)
+    turns = function(point)[1] is not None
+    value, slope = jacobian_of(flat, point, lambda value: _twist(value, turns))
     return torch.where(torch.isfinite(value).all(-1)[..., None, None], slope, torch.nan)
 
 
-def _twist(value: Tensor) -> Tensor:
+def _twist(value: Tensor, turns: bool) -> Tensor:
     """What of the changes of position and rotation matrix side by side, `... x 3` or `... x 12`, is the change of the
-    position and the rotation vector: `... x 3 x 3` or `... x 6 x 12`."""
-    shift = torch.eye(3, dtype=value.dtype, device=value.device).expand(*value.shape[:-1], 3, 3)
-    if value.shape[-1] == 3:
+    position and the rotation vector: `... x 3 x 3` or `... x 6 x 12`; alike where readings stand for the position."""
+    c = value.shape[-1] - 9 * turns
+    shift = torch.eye(c, dtype=value.dtype, device=value.device).expand(*value.shape[:-1], c, c)
+    if not turns:
         return shift
     # dR = [ω]x R, so that ω_k is half the sum of the products of dR's entries with those of [e_k]x R.
-    rotation = value[..., 3:].reshape(*value.shape[:-1], 1, 3, 3)
+    rotation = value[..., c:].reshape(*value.shape[:-1], 1, 3, 3)
     turn = (skew(torch.eye(3, dtype=value.dtype, device=value.device)) @ rotation).flatten(-2) / 2
-    return torch.cat(
-        [torch.cat([shift, torch.zeros_like(turn)], -1), torch.cat([torch.zeros_like(shift), turn], -1)], -2
-    )
+    none = turn.new_zeros(*turn.shape[:-2], c, 9), turn.new_zeros(*turn.shape[:-2], 3, c)
+    return torch.cat([torch.cat([shift, none[0]], -1), torch.cat([none[1], turn], -1)], -2)

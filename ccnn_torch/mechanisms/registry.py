@@ -216,13 +216,18 @@ def _partial(mechanism: str | Mapping[str, Any], pose: Sequence[str], keys: Mapp
 
 def _instrument(
     mechanism: str | Mapping[str, Any],
-    kind: str,
-    link: int | None = None,
+    kind: str | None = None,
+    instruments: Sequence[Mapping[str, Any]] | None = None,
     keys: Mapping[str, Any] | None = None,
     **of_instrument: Any,
 ) -> Instrument:
-    """A mechanism by name or file with its keys, or by description, seen through an instrument."""
-    return instrument(_inside(mechanism, keys), kind, link, of_instrument)
+    """A mechanism by name or file with its keys, or by description, seen through one or several instruments."""
+    if (kind is None) == (instruments is None) or (instruments is not None and of_instrument):
+        raise InputError(
+            "mechanism 'instrument': write kind and its keys, or instruments: a list of these, "
+            "e.g. [{kind: wire, anchors: 2}, {kind: level}, {kind: pose}]"
+        )
+    return instrument(_inside(mechanism, keys), instruments or [{"kind": kind, **of_instrument}])
 
 
 def _pair(first: str | Mapping[str, Any], second: str | Mapping[str, Any]) -> Pair:
@@ -275,7 +280,7 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         allow_code: run the Python file that an identified machine's mechanism file names.
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
             framed: mechanism, its keys, base, tool, frame_per, tool_per; partial: mechanism, its keys, pose;
-            instrument: mechanism, its keys, kind, link, and those of the kind; …).
+            instrument: mechanism, its keys, kind, link, and those of the kind, or instruments; …).
 
     Raises:
         InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, a

@@ -219,6 +219,7 @@ def load_records(
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
     pose, coordinates, orientation, read = read_pose(table, mechanism, partial=True)
     _refuse_empty(table, pose, coordinates)
+    _refuse_without_given(table, mechanism, pose, coordinates)
     used = {joint.name for joint in mechanism.joints} | set(read)
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
@@ -323,6 +324,22 @@ def _refuse_empty(table: Table, pose: NDArray[np.float64], coordinates: Sequence
         )
 
 
+def _refuse_without_given(
+    table: Table, mechanism: HasCoordinates, pose: NDArray[np.float64], coordinates: Sequence[Coordinate]
+) -> None:
+    """Raise `InputError` where an instrument read something and what it was pointed at is not said."""
+    names = [c.name for c in coordinates]
+    for name, reads in getattr(mechanism, "given_of", {}).items():
+        mine = [names.index(one) for one in reads if one in names]
+        lacking = np.isnan(pose[:, names.index(name)]) if name in names else np.ones(len(pose), dtype=bool)
+        wrong = np.flatnonzero(lacking & ~np.isnan(pose[:, mine]).all(1))
+        if mine and len(wrong):
+            raise InputError(
+                f"{table.path}: column '{name}' is empty at {table.name_rows(wrong)}, where {', '.join(reads)} was "
+                "read; say what it was read of"
+            )
+
+
 def _loaded(
     records: Records,
     mechanism: HasCoordinates,
@@ -342,8 +359,13 @@ def _loaded(
     return records
 
 
+def fewest_rows(inputs: int) -> int:
+    """Rows that a learner of so many inputs needs."""
+    return 2 * (inputs + 1)
+
+
 def _check_enough(table: Table, inputs: int) -> None:
-    least = 2 * (inputs + 1)
+    least = fewest_rows(inputs)
     if len(table) < least:
         raise InputError(
             f"{table.path}: {len(table)} rows are too few, at least {least} are needed: a linear fit in {inputs} "

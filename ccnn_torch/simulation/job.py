@@ -237,14 +237,15 @@ def simulate_records(
     for one in wanted:
         if one.outlier:
             chosen, added, parameters = bad_rows(one, rows, frame.shape[-1], generator)
-            frame = _moved(frame, (situation.visible @ added.unsqueeze(-1)).squeeze(-1))
+            turns = machine.frame(machine.home_pose)[1] is not None
+            frame = _moved(frame, (situation.visible @ added.unsqueeze(-1)).squeeze(-1), turns)
             outliers |= set(chosen.tolist())
             injected.append(Injected(one.name, parameters, _rms(added)))
         else:
             injected.append(next(alone))
     pose = measured_pose(situation, frame)
     errors = sigma * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
-    pose = _moved(pose, errors) if machine.orientations and pose.shape[-1] == 6 else pose + errors
+    pose = _moved(pose, errors, True) if machine.orientations and pose.shape[-1] == 6 else pose + errors
     if sees_directions(machine):
         # A direction has no length that could be measured.
         pose = pose * (situation.pose.norm(dim=-1) / pose.norm(dim=-1))[:, None]
@@ -270,12 +271,12 @@ def _rms(change: Tensor) -> float:
     return float(change[..., :3].square().sum(-1).mean().sqrt())
 
 
-def _moved(frame: Tensor, change: Tensor) -> Tensor:
-    """Positions shifted and, where there are any, rotations turned in the base frame; `... x c` both."""
-    position = frame[..., :3] + change[..., :3]
-    if frame.shape[-1] == 3:
-        return position
-    turned = rotation_vector_to_matrix(change[..., 3:]) @ rotation_vector_to_matrix(frame[..., 3:])
+def _moved(frame: Tensor, change: Tensor, turns: bool) -> Tensor:
+    """Positions shifted and, where they are part of it, rotations turned in the base frame; `... x c` both."""
+    if not turns:
+        return frame + change
+    position = frame[..., :-3] + change[..., :-3]
+    turned = rotation_vector_to_matrix(change[..., -3:]) @ rotation_vector_to_matrix(frame[..., -3:])
     return torch.cat([position, matrix_to_rotation_vector(turned)], -1)
 
 

@@ -16,6 +16,7 @@ from ccnn_torch.effects import Situation, default_gravity, measured_pose, reache
 from ccnn_torch.effects.columns import inside
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import (
+    Instrument,
     Mechanism,
     PoseError,
     Seen,
@@ -106,6 +107,8 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
             )
     names = [c.name for c in records.pose_coordinates]
     pose = records.pose[:, [names.index(c.name) for c in machine.pose]]
+    if isinstance(machine, Instrument):
+        machine = machine.placed(records.joints, pose)
     guess = completed(machine, records.joints, pose)
     rows = Situation(machine, records.joints, _covariates(model, records), default_gravity(machine), None, guess)
     found = [_found(model, place) for place in rows.places]
@@ -116,13 +119,15 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
             machine.around(m) if isinstance(machine, Seen) else as_measured(m, machine.pose, records.path, pose)
             for m in (model.machine.nominal, model.machine.identified)
         )
+        real = real.placed(records.joints, pose) if isinstance(real, Instrument) else real
         predicted = real.forward_kinematics(records.joints, guess=guess)
         if model.machine.acting:
             here = replace(rows, mechanism=nominal_of, gravity=model.machine.gravity)
             predicted = measured_pose(here, reached(here, model.machine.acting, real.nominal))
     else:
         there = rows.moved(ideal, None)
-        predicted = machine.forward_kinematics(there.joints, guess=there.guess)
+        real = machine.placed(there.joints, pose) if isinstance(machine, Instrument) else machine
+        predicted = real.forward_kinematics(there.joints, guess=there.guess)
     lost = np.flatnonzero(~(torch.isfinite(nominal) & torch.isfinite(predicted)).all(-1).numpy())
     if len(lost):
         raise InputError(

@@ -21,6 +21,7 @@ from ccnn_torch.identification import (
     what_is_known,
 )
 from ccnn_torch.mechanisms import Instrument, SerialArm
+from ccnn_torch.mechanisms.frames.instrument import Part
 from ccnn_torch.mechanisms.frames.readings import Between, Dial, Reading, Wire
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
@@ -115,7 +116,7 @@ def test_a_plate_that_was_printed_inexactly_has_its_own_scale() -> None:
 
 def read(arm: SerialArm, reading: Reading, joints: Tensor, rows: Tensor, weights: Tensor | None = None) -> Problem:
     """What an instrument reads with a noise of 0.1 um, its own unknowns fitted first."""
-    seen = Instrument(arm, reading)
+    seen = Instrument(arm, Part(reading))
     seen = seen.with_nominal(seen.fitted(joints, rows, weights))  # type: ignore[assignment]
     choice = replace(CHOICE, free=[*(CHOICE.free or ()), *(p.name for p in reading.parameters)])
     problem = forward_problem(seen, joints, rows, None, choice, [1e-7] * len(seen.pose))

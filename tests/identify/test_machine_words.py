@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ccnn_torch.compensation import load_compensation
 from ccnn_torch.identification.klipper import printer_table
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.kinds.machine_file import template
@@ -45,11 +47,11 @@ def test_a_gantry_has_squareness_and_leads(seed: int, tmp_path: Path, cli: Cli) 
     out = tmp_path / "found"
     words = (f"records={tmp_path / 'gantry.csv'}", f"mechanism={tmp_path / 'gantry.yaml'}", "save_report=false")
     code, screen, _ = cli("identify", *words, "--out", out)
-    assert code == 0 and "squareness xy [µm/m]" in screen and "12 of 12 parameters are identified" in screen
+    assert code == 0 and "squareness xy [µm/m]" in screen and "18 of 18 parameters are identified" in screen
     assert "squareness xy [µm/m]" in (out / "identified.md").read_text()
     rows = list(csv.DictReader((out / "identified.csv").read_text().splitlines()))
     told = {(r["name"], r["quantity"]): float(r["value"]) for r in rows if r["subject"] == "number"}
-    assert {r["unit"] for r in rows if r["subject"] == "number"} == {"um/m"}
+    assert {r["unit"] for r in rows if r["subject"] == "number"} == {"um/m", "um"}
     for name, value in numbers.items():
         assert abs(told[name, "value"] - value) < 3.5 * told[name, "sd"] < 40
     found = json.loads((out / "identified.json").read_text())["parameters"]["squareness_xy"]
@@ -74,6 +76,69 @@ def test_a_diagnosis_tells_the_geometry_in_these_words(tmp_path: Path, cli: Cli)
     assert found["verdict"]["effects"] == ["geometry"]
     block = next(e for e in found["effects"] if e["name"] == "geometry")["parameters"]["lead_x"]
     assert (block["word"], block["shown"]) == ("lead x", "um/m")
+
+
+BOWS = {"EYX": 30, "EZX": -12, "EXY": 25, "EZY": 8, "EXZ": -15, "EYZ": 10}
+PITCH = [[0, 0.3, 1.0], [2e-6, 14e-6, -7e-6]]
+
+
+def _reached(joints: Array, error: bool) -> Array:
+    """Where a gantry of 1000 x 800 x 300 mm is, its table of x known: bows of ISO 230-1, x too long, y leaning."""
+    place = joints + np.interp(joints[:, 0], *PITCH)[:, None] * [1, 0, 0]
+    if error:
+        bow = 1 - (2 * joints / [1.0, 0.8, 0.3] - 1) ** 2
+        for name, value in BOWS.items():
+            place[:, "XYZ".index(name[1])] += value * UM * bow[:, "XYZ".index(name[2])]
+        place[:, 0] += 80 * UM * joints[:, 0] + 120 * UM * joints[:, 1]
+    return np.asarray(place)
+
+
+def test_straightness_is_found_beyond_a_known_table_and_commanded_away(tmp_path: Path, cli: Cli) -> None:
+    rng = np.random.default_rng(1)
+    joints = rng.uniform(0, [1, 0.8, 0.3], (150, 3))
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    seen = _reached(joints, True) @ turn.T + [2, 1, 0.5] + rng.normal(0, 1.5e-6, (150, 3))
+    columns = {f"q{k + 1}[m]": joints[:, k] for k in range(3)} | {f"{a}[m]": seen[:, k] for k, a in enumerate("xyz")}
+    records, machine, out = tmp_path / "r.csv", tmp_path / "g.yaml", tmp_path / "found"
+    write_table(records, columns)
+    table = "pitch_errors: {q1: {at: [0 mm, 300 mm, 1000 mm], error: [2 um, 14 um, -7 um]}}"
+    machine.write_text(f"{template('gantry')}{table}\n")
+    code, screen, told = cli(
+        "identify", f"records={records}", f"mechanism={machine}", "save_report=false", "--out", out
+    )
+    assert code == 0, told
+    assert "straightness EYX [µm]" in screen
+    found = json.loads((out / "identified.json").read_text())["parameters"]
+    for name, value in BOWS.items():
+        block = found[f"straightness_{name}"]
+        assert abs(block["value"] - value * UM) < 3.5 * block["sd"] < 2.5e-6
+        assert (block["word"], block["shown"]) == (f"straightness {name}", "um")
+    assert abs(found["squareness_xy"]["value"] - 120 * UM) < 3.5 * found["squareness_xy"]["sd"] < 4e-6
+    assert abs(found["lead_x"]["value"] - 80 * UM) < 3.5 * found["lead_x"]["sd"] < 4e-6
+    plain = ("--no-network", "--quiet")
+    code, _, _ = cli("diagnose", "--records", records, "--mechanism", machine, *plain, "--out", tmp_path / "why")
+    said = json.loads((tmp_path / "why" / "diagnosis.json").read_text())
+    assert {*said["verdict"]["effects"]} == {"geometry", "parameter straightness"}
+    assert "straightness EYX 29" in (tmp_path / "why" / "diagnosis.md").read_text()
+    # On the true machine, but for where it stands.
+    fresh = rng.uniform(0.01, [0.99, 0.79, 0.29], (80, 3))
+    command = np.asarray(load_compensation(out / "identified.yaml")(fresh)["command"])
+    left, before = (_reached(q, True) - _reached(fresh, False) for q in (command, fresh))
+    assert _beside_a_motion(left, fresh) < 1.5e-6 < 0.1 * _beside_a_motion(before, fresh)
+    # The controller's own C has the parabolas and the table.
+    code, _, told = cli("export", out / "identified.yaml", "--to", "c99", "--out", tmp_path / "c")
+    assert code == 0, told
+    told = subprocess.run(["make", "-s", "test"], cwd=tmp_path / "c", capture_output=True, text=True).stdout
+    assert told.startswith("0 of ")
+
+
+def _beside_a_motion(gap: Array, place: Array) -> float:
+    """RMS over rows of what a shift and a small turn of the whole leave of gaps `s x 3` [m]."""
+    eye = np.eye(3)
+    columns = [np.broadcast_to(e, gap.shape) for e in eye] + [np.cross(e, place) for e in eye]
+    design = np.stack(columns, -1).reshape(-1, 6)
+    left = gap.ravel() - design @ np.linalg.lstsq(design, gap.ravel(), rcond=None)[0]
+    return float(np.sqrt(np.square(left).sum() / len(gap)))
 
 
 def test_a_coupling_of_a_scara_is_told_by_the_turn(tmp_path: Path, cli: Cli) -> None:

@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from arm_text import ALPHA, A, D, arm_text
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import ccnn_torch
+from ccnn_torch.calibration.calibrate import calibrate
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 
@@ -33,6 +36,17 @@ def _frame(twist: list[float]) -> Array:
     return at
 
 
+def _flange(q: Array, errors: Array) -> Array:
+    """The flange in the arm's base, `4 x 4`."""
+    at = np.eye(4)
+    for angle, a, d, alpha, e in zip(q, A, D, ALPHA, errors.T, strict=True):
+        c, s, ca, sa = np.cos(angle + e[0]), np.sin(angle + e[0]), np.cos(alpha + e[3]), np.sin(alpha + e[3])
+        x, z = a + e[2], d + e[1]
+        link = [[c, -s * ca, s * sa, x * c], [s, c * ca, -c * sa, x * s], [0, sa, ca, z], [0, 0, 0, 1]]
+        at = at @ np.array(link)
+    return np.asarray(at)
+
+
 def _measured(folder: Path, seed: int, turned: bool = True, rows: int = 120) -> Array:
     """Writes records of an arm with errors, each row from one of the stations with one of the tools; the errors."""
     draw = np.random.default_rng(seed)
@@ -40,13 +54,7 @@ def _measured(folder: Path, seed: int, turned: bool = True, rows: int = 120) -> 
     joints, station, tool = draw.uniform(-1.6, 1.6, (rows, 6)), draw.integers(0, 2, rows), draw.integers(0, 2, rows)
     lines = []
     for q, s, t in zip(joints, station, tool, strict=True):
-        at = _frame(STATIONS[s])
-        for angle, a, d, alpha, e in zip(q, A, D, ALPHA, errors.T, strict=True):
-            c, s_, ca, sa = np.cos(angle + e[0]), np.sin(angle + e[0]), np.cos(alpha + e[3]), np.sin(alpha + e[3])
-            x, z = a + e[2], d + e[1]
-            link = [[c, -s_ * ca, s_ * sa, x * c], [s_, c * ca, -c * sa, x * s_], [0, sa, ca, z], [0, 0, 0, 1]]
-            at = at @ np.array(link)
-        at = at @ _frame(TOOLS[t])
+        at = _frame(STATIONS[s]) @ _flange(q, errors) @ _frame(TOOLS[t])
         spun = Rotation.from_rotvec(draw.normal(0, TURN_NOISE, 3)) * Rotation.from_matrix(at[:3, :3])
         place = at[:3, 3] + draw.normal(0, NOISE, 3)
         lines.append([*q, *place, *(spun.as_rotvec() if turned else ()), s + 1, t + 1])
@@ -133,3 +141,43 @@ def test_a_group_without_rows_to_identify_from_is_refused(tmp_path: Path) -> Non
         ccnn_torch.identify(**keys, constraint={"kind": "pose"})
     with pytest.raises(InputError, match="transfer: takes an arm with one frame"):
         ccnn_torch.identify(**keys, transfer=keys["records"])
+
+
+@pytest.mark.parametrize("tools", [1, 2])
+def test_a_run_corrects_an_arm_that_was_measured_in_several_set_ups(tools: int, tmp_path: Path) -> None:
+    """Its model is of the arm in its own base: on the true arm it leaves a rigid motion, whatever the station."""
+    errors = _measured(tmp_path, 1)
+    table = np.loadtxt(tmp_path / "r.csv", delimiter=",", skiprows=1)
+    header = (tmp_path / "r.csv").read_text().partition("\n")[0]
+    table = table[table[:, -1] <= tools]
+    np.savetxt(tmp_path / "some.csv", table, "%.17g", ",", header=header, comments="")
+    (tmp_path / "arm.yaml").write_text(ARM + "frame_per: [station]\n" + "tool_per: [tool]\n" * (tools > 1))
+    keys = {"records": str(tmp_path / "some.csv"), "mechanism": str(tmp_path / "arm.yaml"), "methods": ["constant"]}
+    found = calibrate(RunConfig.from_keys(**keys, geometry="identify", effects="none"))
+    position = found.results.pose.position
+    assert position.explained is not None and position.after.rms.median is not None
+    before, explained = position.before.rms.median, position.explained.rms.median
+    assert explained is not None and before is not None
+    assert explained < 1.4 * np.sqrt(3) * NOISE and explained < 0.1 * before
+    # Commands are damped near singular poses of the wrist, some of which are among the rows.
+    assert position.after.rms.median < 0.4 * before
+    q = np.random.default_rng(3).uniform(-1.5, 1.5, (60, 6))
+    told = found.compensator()
+    solved = told.solve(torch.from_numpy(q), torch.zeros(60, 0, dtype=torch.float64))
+    exact = (solved.status == 0).numpy()
+    assert exact.sum() > 30
+    q, command = q[exact], solved.command.numpy()[exact]
+    wanted = found.mechanism().forward_kinematics(torch.from_numpy(q))[:, :3].numpy()
+    # The tool of the model is that of the first training row.
+    left, before = (
+        min(_apart(np.array([(_flange(v, errors) @ _frame(t))[:3, 3] for v in at]), wanted) for t in TOOLS[:tools])
+        for at in (command, q)
+    )
+    assert left < 6e-5 and left < 0.1 * before
+
+
+def _apart(one: Array, other: Array) -> float:
+    """RMS of what a rigid motion leaves between points (Kabsch)."""
+    here, there = one - one.mean(0), other - other.mean(0)
+    turn = Rotation.align_vectors(there, here)[0]
+    return float(np.sqrt(((turn.apply(here) - there) ** 2).sum(1).mean()))

@@ -92,7 +92,7 @@ def choose_model(
     verdict: Verdict | None,
     asked_effects: bool,
     learner_open: bool,
-    learns: bool = True,
+    unlearnable: str = "",
 ) -> ModelChoice:
     """Compare what the config leaves open by the held-out pose errors under the candidates' own commands.
 
@@ -106,14 +106,13 @@ def choose_model(
         verdict: effects that were found in the training rows, or that a file names; None without any.
         asked_effects: whether the effects are a part of every candidate.
         learner_open: whether the config leaves the learner to the comparison.
-        learns: whether there is anything that a learner could have.
+        unlearnable: why there is nothing that a learner could have; empty where there is.
     """
+    learns = not unlearnable
     name, other = mechanism.name, _ELSE if learns else "constant"
     geometry_why = ""
     if geometry != "none" and not mechanism.geometry:
         geometry_why = f"{name} has no geometric parameters to identify."
-    elif geometry != "none" and mechanism.grouped:
-        geometry_why = f"{name} has frames per group of rows, and identified geometry has one."
     if geometry_why and geometry == "identify":
         # It is refused where it is fitted, with what to do.
         return ModelChoice(True, False, other, "geometry=identify was asked for.")
@@ -126,7 +125,7 @@ def choose_model(
     asked = "" if geometry == "auto" else geometry_why or f"geometry={geometry} was asked for."
     nominal_too = False in identify and not asked_effects and learns
     if not physical or (len(physical) == 1 and not nominal_too and not (learner_open and learns)):
-        why = "" if learns else "Each row is of two places, so that no learner is trained."
+        why = f"No learner is trained: {unlearnable}." if unlearnable else ""
         return ModelChoice(identify[0], effects[0], other, f"{asked} {why}".strip())
     rows = torch.cat([split.train, split.validation])
     if len(rows) > _MOST_ROWS:
@@ -164,7 +163,7 @@ def _errors(
     """
     joints, pose, weight = records.joints, records.pose, settings["rotation_weight"]
     gaps = pose.isnan().any(-1)
-    frames, _ = frames_of_repeats(mechanism, records, folds, "geometry" if physical else "")
+    frames, _ = frames_of_repeats(mechanism, records, folds)
     held = torch.zeros(len(folds), len(joints), dtype=torch.float64)
     for k, fold in enumerate(folds):
         held[k, fold.test] = 1.0

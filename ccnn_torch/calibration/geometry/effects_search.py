@@ -45,8 +45,6 @@ def search_effects(
     """
     if isinstance(mechanism, BlackBox):
         return None, ["Effects were not searched: of a simulator every row takes long; see ccnn diagnose."]
-    if mechanism.grouped:
-        return None, ["Effects were not searched: one compensator needs one frame, and these rows have several."]
     if len(rows) > _MOST_ROWS:
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]
     rows = rows.sort().values

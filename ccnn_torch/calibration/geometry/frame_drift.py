@@ -32,8 +32,7 @@ def without_frame_drift(
         The records; the verdict without the drift, None where it then names nothing; and notes.
     """
     others, drift = verdict.of_machine()
-    # Frames by group of rows are refused beside effects.
-    if drift is None or mechanism.grouped:
+    if drift is None:
         return records, verdict, []
     recorded = situation_of(records, mechanism)
     situation = in_time(on_fitted_frames(recorded), moments(records))

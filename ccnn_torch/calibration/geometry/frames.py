@@ -6,32 +6,18 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.rows.dataset import Dataset, pad_rows
-from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_unknown, judge_frames
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
 
 
-def frames_of_repeats(
-    mechanism: Mechanism, records: Records, splits: list[Split], one_for: str = ""
-) -> tuple[Tensor | None, list[str]]:
+def frames_of_repeats(mechanism: Mechanism, records: Records, splits: list[Split]) -> tuple[Tensor | None, list[str]]:
     """Fit frames that are unknown to the rows of each repeat that are not held out.
-
-    Args:
-        one_for: key of the config that needs one frame for all rows, if any.
 
     Returns:
         All parameters, nominal but for the frames, `r x 1 x k`, or `r x s x k` where frames are per group; None where
         all frames are known; and notes.
-
-    Raises:
-        InputError: frames per group of rows where one is needed.
     """
-    if one_for and mechanism.grouped:
-        raise InputError(
-            f"{one_for}: {mechanism.name} has frames per group of rows (frame_per, tool_per), and one compensator "
-            f"needs one frame; take the rows of one group, or write {one_for}=none"
-        )
     rows = pad_rows([Dataset.part(split, "fit") for split in splits])
     weights = torch.zeros(len(splits), len(records.joints), dtype=torch.float64)
     weights.scatter_add_(1, rows.index, rows.weights)

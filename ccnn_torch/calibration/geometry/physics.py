@@ -11,8 +11,10 @@ from torch import Tensor
 from ccnn_torch.calibration.rows.dataset import Dataset
 from ccnn_torch.compensation import machine_parts
 from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Known, Verdict, read_verdict
+from ccnn_torch.diagnosis.from_records import in_own_base
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.diagnosis.residual.linearisation import remainder
+from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.display import short_path
 from ccnn_torch.effects import (
     Acting,
@@ -47,7 +49,7 @@ class Physics:
     Attributes:
         source: where the effects come from, for people; empty without any.
         situations: all rows on the nominal machine of each repeat, frames fitted, without time.
-        values: all parameters of the real machine, `r x 1 x k` [SI].
+        values: all parameters of the real machine, `r x 1 x k` [SI], or `r x s x k` where groups of rows have frames.
         acting: effects on joints and pose, of each repeat.
         every: all of the effects, those on the parameters as well, whose change is in `values`.
         rows: which were fitted to, `r x s` bool.
@@ -68,12 +70,12 @@ class Physics:
         here = replace(self.situations[repeat], joints=moved)
         if second:
             here = here.moved([moved, *second], here.parameters)
-        return reached(here, self.acting[repeat], self.values[repeat, 0])
+        return reached(here, self.acting[repeat], self.values[repeat])
 
     def poses(self, repeat: int, moved: Tensor) -> Tensor:
         """The same as pose coordinates, `s x p` [SI]."""
         here = replace(self.situations[repeat], joints=moved)
-        return measured_pose(here, reached(here, self.acting[repeat], self.values[repeat, 0]))
+        return measured_pose(here, reached(here, self.acting[repeat], self.values[repeat]))
 
     def targets(self, joints: Tensor, pose: Tensor, settings: dict[str, Any]) -> Pseudoerror:
         """What is left to be learned: the joints at which this machine has the measured pose, less the command.
@@ -98,7 +100,7 @@ class Physics:
                 left = whole - moved_joints(replace(one, joints=joints + left), own)
             parts.append(left)
         about = zip(self.situations, self.acting, self.values, strict=True)
-        left = torch.stack([remainder(one, pose, own, values[0])[:, :3].norm(dim=-1) for one, own, values in about])
+        left = torch.stack([remainder(one, pose, own, values)[:, :3].norm(dim=-1) for one, own, values in about])
         outlier = self.rows & ~inlying(left, self.rows, 3, 0)
         reasons = found.reasons | {"outlier": outlier}
         return replace(found, deviation=torch.stack(parts), usable=found.usable & ~outlier, reasons=reasons)
@@ -118,13 +120,25 @@ class Physics:
         Raises:
             InputError, MethodFailedError: see `machine_parts`.
         """
-        there = _rows(self.situations[repeat], rows)
+        there, values = self.in_own_base(repeat, rows)
         # Commands are for whole poses, whatever of them was measured; but of a tool that was seen in part the rest is
         # not known.
         same = (len(a.effect.coefficients(there.whole)) == len(a.coefficients) for a in self.acting[repeat])
         there = there.visits if all(same) else there
-        values = self.values[repeat, 0, : len(there.mechanism.geometry)]
+        values = values[: len(there.mechanism.geometry)]
         return machine_parts(there, self.acting[repeat], values, covariates, margin)
+
+    def in_own_base(self, repeat: int, rows: Tensor) -> tuple[Situation, Tensor]:
+        """Some rows on the nominal machine, and all parameters of the real one, `k` [SI].
+
+        Both in the machine's own base where groups of rows have frames, with the tool of the first training row.
+        """
+        every, values = self.situations[repeat], self.values[repeat]
+        if every.parameters is None or not every.mechanism.grouped:
+            return picked(every, rows), values[0]
+        first = int(self.rows[repeat].double().argmax())
+        there = picked(replace(every, parameters=every.parameters[[first]].expand_as(every.parameters)), rows)
+        return in_own_base(there, values[first])
 
     def block(self) -> dict[str, dict[str, Values]]:
         """For results.json: each coefficient's value in every repeat, by effect and name."""
@@ -158,7 +172,7 @@ def fit_physics(
 
     Args:
         verdict: effects with their shapes, which stay; None = no effects.
-        parameters: with fitted frames, `r x 1 x k`; None = nominal.
+        parameters: with fitted frames, `r x 1 x k` or `r x s x k`; None = nominal.
         usable: rows fit to learn from, `[r x] s` bool.
         identify: whether all parameters are to be identified.
 
@@ -184,7 +198,7 @@ def fit_physics(
         known, notes = verdict.on(replace(rows, parameters=None), identify)
     situations, every, values, fitted_to = [], [], [], []
     for k, split in enumerate(splits):
-        base = None if parameters is None else parameters[k, 0]
+        base = None if parameters is None else parameters[k] if mechanism.grouped else parameters[k, 0]
         situation = on_fitted_frames(replace(rows, parameters=base))
         fit = torch.zeros(len(records.joints), dtype=torch.bool)
         fit[Dataset.part(split, "fit")] = True
@@ -195,7 +209,7 @@ def fit_physics(
                 own = own + one.change(situation)[0]
         situations.append(situation)
         every.append(fitted)
-        values.append(own)
+        values.append(own if own.dim() > 1 else own[None])
         fitted_to.append(fit)
     acting = [[a for a in one if a.effect.kind != "parameters"] for one in every]
     if identify:
@@ -210,7 +224,13 @@ def fit_physics(
         seen = "; their periods and other shapes are the file's, which may have seen the held-out rows"
         found = verdict.path == TRAINING_ROWS
         notes.append(f"Effects{'' if found else f' of {source}'}: {named}. {fitted_anew}{'' if found else seen}.")
-    return Physics(source, situations, torch.stack(values).unsqueeze(1), acting, every, torch.stack(fitted_to)), notes
+    if mechanism.grouped:
+        tool = " Its tool is that of the first training row." if mechanism.tool_per else ""
+        notes.append(
+            "The model is of the machine in its own base: groups of rows have frames of their own, in which those held "
+            f"out are judged.{tool}"
+        )
+    return Physics(source, situations, torch.stack(values), acting, every, torch.stack(fitted_to)), notes
 
 
 def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) -> None:
@@ -228,10 +248,3 @@ def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) ->
             f"{what}; the column is there but no input of this run, because it is constant or not among covariates: "
             "name it there, give records in which it varies, or write effects=none"
         )
-
-
-def _rows(situation: Situation, rows: Tensor) -> Situation:
-    """Some rows of a situation."""
-    covariates = {name: value[rows] for name, value in situation.covariates.items()}
-    guess = None if situation.guess is None else situation.guess[rows]
-    return replace(situation, joints=situation.joints[rows], covariates=covariates, guess=guess)

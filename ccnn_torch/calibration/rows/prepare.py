@@ -28,6 +28,7 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, load_mechan
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
+from ccnn_torch.records.load import fewest_rows
 from ccnn_torch.records.splits import Column, Split
 from ccnn_torch.simulation.case_study import Simulation, build_case, simulate_realistic
 from ccnn_torch.simulation.realistic import build_machine
@@ -215,10 +216,10 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
-    if _twice(mechanism, records) and method_names(config, "constant") != ["constant"]:
+    unlearnable = _unlearnable(mechanism, records)
+    if unlearnable and method_names(config, "constant") != ["constant"]:
         raise InputError(
-            f"methods: each row of {records.path} is of two places, and what a learner learns has the joints of one; "
-            "leave methods out, and geometry and effects alone are identified and corrected"
+            f"methods: {unlearnable}; leave methods out, and geometry and effects alone are identified and corrected"
         )
     if isinstance(mechanism, SerialArm) and config.geometry != "none":
         mechanism = mechanism.with_link_frames()
@@ -233,9 +234,14 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     return replace(prepared, notes=notes)
 
 
-def _twice(mechanism: Mechanism, records: Records) -> bool:
-    """Whether each row is of two places, so that there is no deviation of joints to learn."""
-    return len(mechanism.places(records.joints, records.pose)) > 1
+def _unlearnable(mechanism: Mechanism, records: Records) -> str:
+    """Why there is no deviation of joints that a learner could have; empty where there is one."""
+    if len(mechanism.places(records.joints, records.pose)) > 1:
+        return f"each row of {records.path} is of two places, and what a learner learns has the joints of one"
+    whole, needed = int(records.whole.sum()), fewest_rows(len(mechanism.joints))
+    if whole >= needed:
+        return ""
+    return f"{whole} rows of {records.path} have all that is measured, and a learner needs the joints of {needed}"
 
 
 def over_all_rows(prepared: Prepared) -> Prepared:
@@ -248,8 +254,7 @@ def over_all_rows(prepared: Prepared) -> Prepared:
 def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepared:
     """Frames, geometry and effects fitted to the rows that are not held out, and what is left to be learned."""
     mechanism, records, settings, choice, verdict = source
-    one_for = "effects" if verdict is not None else "geometry" if choice.identify else ""
-    frames, notes = frames_of_repeats(mechanism, records, splits, one_for)
+    frames, notes = frames_of_repeats(mechanism, records, splits)
     total = deviations = joint_deviations(mechanism, records.joints, records.pose, parameters=frames, **settings)
     about = (mechanism, records, splits, frames, total.known)
     learned, physics, geometry = frames, None, None
@@ -266,8 +271,10 @@ def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepare
     if physics is not None:
         learned = physics.values
         deviations = physics.targets(records.joints, records.pose, settings)
-    if _twice(mechanism, records):
-        deviations = replace(deviations, deviation=torch.zeros_like(deviations.deviation))
+    if _unlearnable(mechanism, records):
+        deviations = replace(
+            deviations, deviation=torch.zeros_like(deviations.deviation), usable=deviations.known.clone()
+        )
     guess = completed(mechanism, records.joints, records.pose, frames)
     jacobian = mechanism.jacobian(records.joints, learned, guess=guess)
     return Prepared(
@@ -319,7 +326,7 @@ def _choice(
         verdict,
         asked,
         method_names(config, "") == [""],
-        not _twice(mechanism, records),
+        _unlearnable(mechanism, records),
     )
     choice = choose_model(mechanism, records, *about)
     return choice, verdict if choice.effects else None, records, notes

@@ -168,7 +168,8 @@ def _remainder(situation: Situation, measured: Tensor, anew: bool) -> str:
     """What the usual row is off by in position, or where that is not measured in orientation."""
     other = placed(situation, measured) if anew else situation
     residual = pose_residual(replace(other, guess=None if situation.guess is None else measured), measured)
-    place, turn = (float(part.norm(dim=-1).nanmedian()) for part in (residual[:, :3], residual[:, 3:]))
+    turns = torch.tensor([c.unit == "rad" for c in situation.mechanism.channels])
+    place, turn = (float(part.norm(dim=-1).nanmedian()) for part in (residual[:, ~turns], residual[:, turns]))
     return f"{1e3 * place:.3g} mm" if place > 0 else f"{1e3 * turn:.3g} mrad"
 
 

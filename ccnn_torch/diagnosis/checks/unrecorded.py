@@ -54,20 +54,21 @@ def missing_covariates(
     kinds = {k: [n for n in drawn if n.startswith(k) and n not in names] for k in _KINDS}
     # One machine for all of them: its derivatives may be dear.
     there = replace(here, covariates=drawn | dict(here.covariates))
-    position = bool((analysis.whitening.channels < 3).any())
+    position = bool(analysis.whitening.lengths.any())
+    alike = [k for k, c in enumerate(mechanism.channels) if (c.unit == "m") == position]
     found: dict[tuple[str, ...], dict[str, float]] = {}
     for effect in (e for e in effects if lacking.get(e.name)):
         added = next((a for a in _additions(kinds) if not effect.missing(mechanism, [*names, *a])), None)
         size = 0.0
         # A user's own effect that fails on columns that were not recorded must not cost the verdict.
         with suppress(InputError):
-            size = 0.0 if added is None or missing_on(effect, there) else _plausible(there, effect, position)
+            size = 0.0 if added is None or missing_on(effect, there) else _plausible(there, effect, alike)
         if added is not None and size > 0:
             found.setdefault(added, {})[effect.name] = size
     for condition in mechanism.lacking(names):
         if condition.name in drawn:
             other = replace(here, covariates={**here.covariates, condition.name: drawn[condition.name]})
-            size = _usual(pose_residual(other, here.pose), position)
+            size = _usual(pose_residual(other, here.pose)[:, alike])
             if size > 0:
                 found.setdefault((condition.name,), {})[mechanism.name] = size
     entries: list[dict[str, Any]] = [
@@ -88,17 +89,16 @@ def _additions(kinds: Mapping[str, list[str]]) -> Iterator[tuple[str, ...]]:
             yield tuple(n for k in some for n in kinds[k])
 
 
-def _plausible(situation: Situation, effect: Effect, position: bool) -> float:
-    """What an effect of plausible size does to the usual row [m] or [rad]."""
+def _plausible(situation: Situation, effect: Effect, channels: Sequence[int]) -> float:
+    """What an effect of plausible size does to the usual row in channels of one unit [m] or [rad]."""
     main = [i for i, c in enumerate(effect.coefficients(situation)) if not c.secondary]
     columns = scaled_signature(situation, effect, default_shape(situation, effect))[..., main]
-    return _usual(columns, position)
+    return _usual(columns[:, channels])
 
 
-def _usual(change: Tensor, position: bool) -> float:
+def _usual(change: Tensor) -> float:
     """Size of a change of the usual row, given as `s x c` or by parts, `s x c x m` [m] or [rad]."""
-    block = torch.nan_to_num(change[:, :3] if position else change[:, 3:])
-    return float(block.square().flatten(1).sum(1).median().sqrt())
+    return float(torch.nan_to_num(change).square().flatten(1).sum(1).median().sqrt())
 
 
 # Log odds that directions, and numbers of rows, must gain beside the verdict, and beyond so many times what those of as

@@ -25,7 +25,14 @@ from ccnn_torch.diagnosis.candidates.nuisance import (
     TrialColumns,
     search_charge,
 )
-from ccnn_torch.diagnosis.discrepancy.smooth import driver_of, joint_moves, platform_moves, spread_out, unit_range
+from ccnn_torch.diagnosis.discrepancy.smooth import (
+    carried_moves,
+    driver_of,
+    joint_moves,
+    platform_moves,
+    spread_out,
+    unit_range,
+)
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Situation
 
@@ -112,7 +119,7 @@ def local_discrepancies(
     moving |= {f"joint {j.name}": moved[..., i : i + 1] for i, j in enumerate(situation.mechanism.joints)}
     rotation = situation.platform[1]
     if rotation is not None and float((rotation - rotation[:1]).abs().max()) > _TURNS:
-        moving["the tool"] = platform[..., :3] @ rotation
+        moving["the tool"] = carried_moves(situation)[..., :3] @ rotation
     if len(y) >= 4 * _FEWEST_ROWS:
         found += [_jump(ground, what, columns) for what, columns in moving.items()]
     if "time" in situation.covariates:

@@ -83,7 +83,7 @@ def remaining_gain(
         of rows. `gap_after` and what follows is None where no network was trained, for the `reason` given.
     """
     white = analysis.whitening
-    position = white.channels < 3
+    position = white.lengths
     channels = position if bool(position.any()) else ~position
     fold = folds(analysis.situation.joints[white.keep()], seed)
     rows = torch.arange(len(fold))

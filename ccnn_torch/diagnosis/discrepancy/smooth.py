@@ -17,13 +17,15 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import Atom, discrepancy
 from ccnn_torch.effects import Situation
 from ccnn_torch.evidence.priors import OUTSIDE
+from ccnn_torch.mechanisms import Instrument
+from ccnn_torch.mechanisms.pose import CHANNELS
 from ccnn_torch.records.commanded import SECOND
 
 # Log odds of one that holds most of what a library effect does beside those of the others.
 _NEAR_LIBRARY = math.log(1e-2)
 # Of one form with an effect that is a candidate, it has to be better than that by as much again.
 _TWIN = 2 * OUTSIDE
-# A joint may be off by this much for unforeseen reasons [m], [rad].
+# A joint or the platform may be off by this much for unforeseen reasons [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
 PLACE = "workspace"
 """The driver of what follows the pose."""
@@ -34,7 +36,6 @@ SPEED = "speed"
 # What bends with a driver against what is proportional to it.
 _BEND = 0.5
 _MOST, _MOST_PLACES = 28, 60
-_PLATFORM = {3: (3e-4, 3e-4, 3e-4), 6: (3e-4, 3e-4, 3e-4, 5e-4, 5e-4, 5e-4)}
 _WAVES = 18
 # Bumps: fewest and most along a driver, rows for each; the same in the workspace; rows for each fine one of a joint.
 _FEWEST, _FEW, _ROWS_A_BUMP = 4, 8, 12
@@ -208,9 +209,18 @@ def joint_moves(situation: Situation, jacobian: Tensor) -> Tensor:
 
 
 def platform_moves(situation: Situation) -> Tensor:
-    """Shifts and turns of the platform as far as they are seen, each as large as is to be expected, `s x c x c`."""
-    visible = situation.visible
-    return visible * torch.tensor(_PLATFORM[visible.shape[-1]], dtype=visible.dtype)
+    """Shifts and turns of the platform as far as they are seen, each as large as is to be expected, `s x c x c`.
+
+    Of what instruments show each reading by itself.
+    """
+    return situation.visible * torch.tensor([_SCALE[c.unit] for c in situation.mechanism.channels]).double()
+
+
+def carried_moves(situation: Situation) -> Tensor:
+    """What is seen of shifts and turns of the platform in space, `s x c x 3` or `s x c x 6`; sizes alike."""
+    if not isinstance(situation.mechanism, Instrument):
+        return platform_moves(situation)
+    return situation.by_place * torch.tensor([_SCALE[c.unit] for c in CHANNELS]).double()
 
 
 def _platform_atom(situation: Situation, driver: str, features: Tensor) -> Atom:
@@ -310,7 +320,7 @@ def _carried(situation: Situation, axes: Tensor) -> Atom:
     """Shifts along axes, `s x 3 x 3`, by a plane over the workspace, and turns about them."""
     place = unit_range(situation.place[:, situation.lengths])
     features = torch.cat([torch.ones_like(place[:, :1]), place], -1)
-    moves = platform_moves(situation)
+    moves = carried_moves(situation)
     shifts = ((moves[..., :3] @ axes)[..., None] * features[:, None, None]).flatten(-2)
     turns = moves[..., 3:] @ axes if moves.shape[-1] == 6 else moves[..., :0]
     columns = torch.cat([shifts, turns], -1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -26,6 +26,7 @@ from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.mechanism_file import write_machine
+from ccnn_torch.mechanisms.pose import CHANNELS
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
 
@@ -151,7 +152,10 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
         if name not in shown or not bool((part[keep] != 0).any()):
             continue
         # In the pose and in the joints; what follows one column best shows the cause best.
-        views = [_along(part, left, keep, columns), _in_joints(analysis, part, left, columns)]
+        views = [
+            _along(part, left, keep, columns, situation.mechanism.channels),
+            _in_joints(analysis, part, left, columns),
+        ]
         scores = [_telling(view, keep, name) for view in views]
         view, (_, (x_name, x_unit, x)) = max(zip(views, scores, strict=True), key=lambda pair: pair[1][0])
         fit, rest, y_axis = view.fit, view.rest, {"name": view.axis.name, "unit": view.axis.unit}
@@ -212,10 +216,10 @@ class _View(NamedTuple):
     drivers: list[Column]
 
 
-def _along(part: Tensor, left: Tensor, keep: Tensor, columns: list[Column]) -> _View:
+def _along(part: Tensor, left: Tensor, keep: Tensor, columns: list[Column], channels: Sequence[Coordinate]) -> _View:
     """Along the direction in which the effect moves the pose most."""
-    direction, unit = _direction(part[keep])
-    return _View(Coordinate(_direction_words(direction), unit), part @ direction, left @ direction, columns)
+    direction, unit = _direction(part[keep], channels)
+    return _View(Coordinate(_direction_words(direction, channels), unit), part @ direction, left @ direction, columns)
 
 
 def _in_joints(analysis: Analysis, part: Tensor, left: Tensor, columns: list[Column]) -> _View:
@@ -250,25 +254,26 @@ def _torques(analysis: Analysis, joint: Coordinate) -> list[Column]:
     return found
 
 
-def _direction(part: Tensor) -> tuple[Tensor, str]:
+def _direction(part: Tensor, channels: Sequence[Coordinate]) -> tuple[Tensor, str]:
     """The direction in which an effect moves the pose most, `c0`: in position, or in rotation where only that moves."""
-    moving = part[:, :3].abs().amax() > 0
-    block = part[:, :3] if moving else part[:, 3:]
-    main = torch.linalg.svd(block, full_matrices=False)[2][0]
+    lengths = torch.tensor([c.unit == "m" for c in channels])
+    moving = bool(part[:, lengths].abs().sum() > 0)
+    alike = lengths if moving else ~lengths
+    main = torch.linalg.svd(part[:, alike], full_matrices=False)[2][0]
     main = main * torch.sign(main[main.abs().argmax()])
     direction = torch.zeros_like(part[0])
-    direction[: 3 if moving else None] = main if moving else 0.0
-    if not moving:
-        direction[3:] = main
+    direction[alike] = main
     return direction, "m" if moving else "rad"
 
 
-def _direction_words(direction: Tensor) -> str:
-    kind, values = ("residual", direction[:3]) if bool(direction[:3].any()) else ("turn", direction[3:])
-    near = int(values.abs().argmax())
-    if float(values.abs()[near]) > 0.99:
-        return f"{kind} along {'xyz'[near]}"
-    return f"{kind} along ({', '.join(f'{float(v):.2f}' for v in values)})"
+def _direction_words(direction: Tensor, channels: Sequence[Coordinate]) -> str:
+    near = int(direction.abs().argmax())
+    unit, name = channels[near].unit, channels[near].name
+    kind = "residual" if unit == "m" else "turn"
+    if float(direction.abs()[near]) > 0.99:
+        return f"{kind} along {name.removeprefix('r') if channels[near] in CHANNELS else name}"
+    values = [float(v) for v, c in zip(direction, channels, strict=True) if c.unit == unit]
+    return f"{kind} along ({', '.join(f'{v:.2f}' for v in values)})"
 
 
 def _drivers(analysis: Analysis, place: Tensor) -> list[Column]:

@@ -47,7 +47,8 @@ def distance(situation: Situation, measured: Tensor, size: Size) -> Tensor:
         size: of the machine.
     """
     residual = pose_residual(situation, measured)
-    far: Tensor = torch.linalg.vector_norm(residual[:, :3], dim=-1) / size.place.clamp_min(_LEAST)
-    if residual.shape[-1] == 6 and size.angle is not None:
-        far = torch.maximum(far, torch.linalg.vector_norm(residual[:, 3:], dim=-1) / size.angle.clamp_min(_LEAST))
+    turns = torch.tensor([c.unit == "rad" for c in situation.mechanism.channels])
+    far: Tensor = torch.linalg.vector_norm(residual[:, ~turns], dim=-1) / size.place.clamp_min(_LEAST)
+    if bool(turns.any()) and size.angle is not None:
+        far = torch.maximum(far, torch.linalg.vector_norm(residual[:, turns], dim=-1) / size.angle.clamp_min(_LEAST))
     return far

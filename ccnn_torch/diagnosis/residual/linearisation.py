@@ -21,9 +21,9 @@ def remainder(
     """
     there, seen = reached(situation, acting, parameters), measured_channels(situation, measured)
     position, rotation = situation.mechanism.frame(filled(situation, measured))
-    left = position - there[..., :3]
-    if rotation is not None and there.shape[-1] == 6:
-        turn = matrix_to_rotation_vector(rotation @ rotation_vector_to_matrix(there[..., 3:]).mT)
+    left = position - there[..., : position.shape[-1]]
+    if rotation is not None:
+        turn = matrix_to_rotation_vector(rotation @ rotation_vector_to_matrix(there[..., -3:]).mT)
         left = torch.cat([left, turn], -1)
     return left if seen is None else torch.where(seen, left, 0.0 * there)
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.residual.whitening import (
     MAD,
     NO_NOISE,
@@ -27,6 +28,7 @@ from ccnn_torch.evidence.marginal_likelihood import (
     groups_of,
     own_products,
 )
+from ccnn_torch.mechanisms.pose import CHANNELS
 
 # The largest model: how many candidates at most, the log evidence from which one is in it, the spread of its log size.
 _LARGEST, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
@@ -48,6 +50,7 @@ def fitted_whitening(
     usable: Tensor,
     seen: Tensor | None = None,
     axes: Tensor | None = None,
+    every: Sequence[Coordinate] | None = None,
 ) -> Whitening:
     """Noise and row weights from the largest model: of everything that may be there, one by one what explains most of
     what is left, as long as the evidence for it is more than slight.
@@ -59,7 +62,7 @@ def fitted_whitening(
         noise: known standard deviation of each of the c0 channels, or None.
         usable: `s`, False where a row is left out from the start.
         seen: which values were measured, `s x c0` bool; None = all.
-        axes: of the device, as in `Whitening`.
+        axes, every: as in `Whitening`; every: those of position and rotation vector when None.
     """
     if axes is not None and seen is not None:
         # A direction that lacks a part is none.
@@ -67,22 +70,23 @@ def fitted_whitening(
     seen = None if seen is None else seen[:, channels]
     given, known = (residual.new_ones(residual.shape[-1]), 0.0) if noise is None else (noise, _KNOWN)
     weight = usable.to(residual.dtype)[:, None].expand(-1, len(channels))
-    white = Whitening(channels, given[channels], weight, known, seen, axes)
+    every = CHANNELS[: residual.shape[-1]] if every is None else every
+    white = Whitening(channels, given[channels], weight, known, seen, axes, every)
     y = white.picked(residual)
     shown = [white.picked(c).to(residual.dtype) for c in columns if c.shape[-1]]
     shown = shown if seen is None else [c * seen[..., None] for c in shown]
     count = float(y.numel()) if seen is None else float(seen.sum())
     if noise is None:
         white = replace(white, sigma=(white.usual(y, usable) * MAD).clamp_min(NO_NOISE))
-    every = _Everything(shown, white)
+    candidates = _Everything(shown, white)
     if noise is None:
-        white = replace(white, sigma=white.sigma * _noise_share(every, y, white).sqrt())
+        white = replace(white, sigma=white.sigma * _noise_share(candidates, y, white).sqrt())
     chosen: list[int] = []
     log_scale = y.new_zeros(1, 0)
     left, free = y, 1.0
     for _ in range(_LARGEST):
         if chosen:
-            own = torch.cat([shown[k] / every.size[k] for k in chosen], -1)
+            own = torch.cat([shown[k] / candidates.size[k] for k in chosen], -1)
             grams, groups = grams_of(white.scaled(own), white.scaled(y)), groups_of(shown[k] for k in chosen)
             fit = fit_sets(grams, [groups], 0.0, _UPDATES, _ANY_SIZE, (log_scale, y.new_ones(1)))
             left, log_scale = y - own @ fit.mean[0], fit.log_scale
@@ -92,9 +96,9 @@ def fitted_whitening(
         if not rest:
             break
         squares = white.scaled(left).square().sum()
-        rough = every.roughly_added(white, left)[rest]
+        rough = candidates.roughly_added(white, left)[rest]
         likely = [rest[k] for k in rough.argsort(descending=True)[:_NEXT].tolist()]
-        products = [own_products(white.scaled(shown[k]), white.scaled(left), every.size[k]) for k in likely]
+        products = [own_products(white.scaled(shown[k]), white.scaled(left), candidates.size[k]) for k in likely]
         fits, _ = fit_single_groups([NO_COLUMNS, *products], squares, Prior(count, 0.0, _ANY_SIZE))
         gain = fits.log_evidence[1:] - fits.log_evidence[0]
         best = int(gain.argmax())

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.residual.correlation import FEWEST_TARGETS
-from ccnn_torch.effects import Situation, pose_residual
+from ccnn_torch.effects import Situation, measured_channels, pose_residual
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import number_targets
 from ccnn_torch.units import si_unit_of
@@ -47,19 +47,22 @@ def noise_of_repeats(situation: Situation, measured: Tensor) -> Noise | None:
     """
     held = [v[:, None] for name, v in situation.covariates.items() if name not in _FREE]
     # Readings of different corners or anchors are none of one target.
-    held.append(measured[:, situation.mechanism.compared :])
-    residual = pose_residual(situation, measured)
+    held.append(measured[:, situation.mechanism.compared :].nan_to_num())
+    residual, seen = pose_residual(situation, measured), measured_channels(situation, measured)
     fine = torch.isfinite(residual).all(-1)
     target = number_targets(torch.cat([situation.joints, *held], -1)[fine], FEWEST_TARGETS)
     if target is None:
         return None
-    count = torch.bincount(target)
-    free = int((count - 1).sum())
-    if free < _FEWEST:
-        return None
     values = residual[fine]
-    mean = torch.zeros(len(count), values.shape[-1], dtype=values.dtype).index_add_(0, target, values)
-    apart = values - (mean / count[:, None])[target]
+    there = torch.ones_like(values) if seen is None else seen[fine].to(values.dtype)
+    count, total = (
+        torch.zeros(int(target.max()) + 1, values.shape[-1], dtype=values.dtype).index_add_(0, target, each)
+        for each in (there, values)
+    )
+    free = (count - 1).clamp_min(0).sum(0)
+    if int(free.min()) < _FEWEST:
+        return None
+    apart = (values - (total / count.clamp_min(1))[target]) * there
     sd = (apart.square().sum(0) / free).sqrt()
     return Noise(sd, "repeats") if bool((sd > 0).any()) else None
 

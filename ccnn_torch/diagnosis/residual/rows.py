@@ -53,7 +53,7 @@ def near_singular(situation: Situation) -> Tensor:
     if sees_directions(situation.mechanism):
         return torch.zeros(len(situation.joints), dtype=torch.bool)
     jacobian = torch.nan_to_num(situation.jacobian[:, channels]).clone()
-    jacobian[:, channels >= 3] *= _LEVER
+    jacobian *= situation.mechanism.channel_weights(_LEVER)[channels][:, None]
     values = torch.linalg.svdvals(jacobian)
     condition = values[:, 0] / values[:, -1].clamp_min(1e-300)
     far: Tensor = (condition > _CONDITION) & (condition > _TIMES_USUAL * condition.median())

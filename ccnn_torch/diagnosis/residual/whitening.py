@@ -9,11 +9,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.residual.tails import weights_of
 from ccnn_torch.effects import Situation
-from ccnn_torch.mechanisms import sees_directions
+from ccnn_torch.mechanisms import Instrument, sees_directions
+from ccnn_torch.mechanisms.pose import CHANNELS
 
-_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 # Beyond how many times its noise a row is set aside, and the quantile of the rows that are never.
 _GROSS, _KEPT = 6.0, 0.8
 NO_NOISE = 1e-10
@@ -39,6 +40,7 @@ class Whitening:
         known: weight of the prior knowledge of the noise, in values; 0 = estimated from these rows.
         seen: which values were measured, `s x c` bool; None = all.
         axes: of the measuring device, in which the channels are, `s x c x c0`; None = those of the base frame.
+        every: names and units of all the c0 channels.
     """
 
     channels: Tensor
@@ -47,11 +49,17 @@ class Whitening:
     known: float
     seen: Tensor | None = None
     axes: Tensor | None = None
+    every: Sequence[Coordinate] = CHANNELS
 
     @property
     def names(self) -> list[str]:
         """What the channels are called."""
-        return ["across", "along"] if self.axes is not None else [_NAMES[int(c)] for c in self.channels]
+        return ["across", "along"] if self.axes is not None else [self.every[int(c)].name for c in self.channels]
+
+    @property
+    def lengths(self) -> Tensor:
+        """Which of the channels are lengths, `c` bool."""
+        return torch.tensor([self.every[int(c)].unit == "m" for c in self.channels])
 
     def __call__(self, values: Tensor) -> Tensor:
         """`s x c0` or `s x c0 x m` raw to `s x c` or `s x c x m`, in units of the noise, rows weighted."""
@@ -68,7 +76,7 @@ class Whitening:
         if self.axes is not None:
             axes = self.axes if rows is None else self.axes[rows]
             return (axes.mT @ values[..., None])[..., 0]
-        out = values.new_zeros(len(values), 3 if int(self.channels.max()) < 3 else 6)
+        out = values.new_zeros(len(values), len(self.every))
         out[:, self.channels] = values
         return out
 
@@ -130,8 +138,11 @@ def moving_channels(situation: Situation) -> Tensor:
     """
     if sees_directions(situation.mechanism):
         return torch.arange(2)
+    mechanism = situation.mechanism
+    if isinstance(mechanism, Instrument):
+        return torch.tensor([k for k, c in enumerate(mechanism.channels) if c.name])
     slope = torch.nan_to_num(situation.frame_slope).square().mean((0, 2))
-    units = [c.unit for c in situation.mechanism.pose[: situation.mechanism.compared]]
+    units = [c.unit for c in mechanism.pose]
     kinds = [(slope[:3], units.count("m"), 0), (slope[3:], units.count("rad"), 3)]
     chosen = [kind.argsort(descending=True, stable=True)[:count] + first for kind, count, first in kinds]
     return torch.cat(chosen).sort().values

@@ -227,7 +227,7 @@ def _about_nominal(situation: Situation, measured: Tensor, effects: Sequence[Eff
     atoms = [a for a in atoms if float((a.columns[:, channels] / largest[:, None]).abs().max()) > _SHOWN]
     everything = [a.columns for a in (*atoms, *rest) if not (a.is_discrepancy and a.name.startswith("joint"))]
     seen = measured_channels(situation, measured)
-    about = channels, noise, usable, seen, device_axes(situation)
+    about = channels, noise, usable, seen, device_axes(situation), situation.mechanism.channels
     white = fitted_whitening(residual, [fitted, *everything], *about)
 
     of_effects = candidates_about_nominal(situation, atoms, white, residual, usable, fitted)

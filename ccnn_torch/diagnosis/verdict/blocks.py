@@ -29,7 +29,7 @@ class Blocks:
         self.analysis, self.judgement, self.residual = analysis, judgement, residual
         self.before = white.picked(residual)[white.keep()]
         self.floor = noise_floor(analysis)
-        self.position = white.channels < 3
+        self.position = white.lengths
         atoms = analysis.atoms
         self.candidates = _candidates(analysis, judgement)
         members = judgement.found.members

@@ -308,7 +308,7 @@ def implausible_size(analysis: Analysis) -> float:
     as much as is to be expected; at least 1.
     """
     white, situation = analysis.whitening, analysis.situation
-    rows, channels = white.keep(), [c for c in white.channels.tolist() if c < 3] or white.channels.tolist()
+    rows, channels = white.keep(), white.channels[white.lengths if bool(white.lengths.any()) else ~white.lengths]
     gap = pose_residual(situation, analysis.measured)[rows][:, channels].square().mean()
     usual = joint_moves(situation, situation.jacobian)[rows][:, channels].square().sum(-1).mean()
     return _IMPLAUSIBLE * max(1.0, float((gap / usual.clamp_min(1e-300)).sqrt()))

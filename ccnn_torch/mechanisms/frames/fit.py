@@ -206,8 +206,7 @@ def fit_frames(
     Raises:
         InputError: too few training rows, in all or in a group, or a group column that is not there.
     """
-    weights = torch.ones(len(joints), dtype=torch.float64) if weights is None else weights
-    weights, pose = torch.where(pose.isnan().any(-1), 0.0, weights), pose.nan_to_num()
+    weights, pose = whole_rows(pose, weights)
     grouped = arm.grouped
     lead = weights.shape[:-1]
     if not arm.unknown_frames:
@@ -262,6 +261,12 @@ def fit_frames(
     values = arm.nominal.expand(*lead, len(base_of[rows]), -1).clone()
     values[..., :6], values[..., -6:] = base[..., base_of[rows], :], tool[..., tool_of[rows], :]
     return values if grouped else values[..., 0, :]
+
+
+def whole_rows(pose: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Weights `... x s` (1 when None), 0 in rows that lack a part of their pose `s x p`, and poses without NaN."""
+    weights = torch.ones(pose.shape[:-1], dtype=pose.dtype) if weights is None else weights
+    return torch.where(pose.isnan().any(-1), 0.0, weights), pose.nan_to_num()
 
 
 def _turned(here: Tensor, there: Tensor, weights: Tensor, group_of: Tensor, groups: int) -> Tensor:

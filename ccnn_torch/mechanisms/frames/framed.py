@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.around import Around
-from ccnn_torch.mechanisms.frames.fit import best_closed_form, rigid_body_frame
+from ccnn_torch.mechanisms.frames.fit import best_closed_form, rigid_body_frame, whole_rows
 from ccnn_torch.mechanisms.machines.links import compose
 from ccnn_torch.mechanisms.machines.serial import FRAME
 from ccnn_torch.mechanisms.mechanism import Mechanism
@@ -175,8 +175,7 @@ class Framed(Around):
 
         A row that lacks a part of its pose (NaN) is left out.
         """
-        weights = torch.ones(joints.shape[:-1], dtype=joints.dtype) if weights is None else weights
-        weights, pose = torch.where(pose.isnan().any(-1), 0.0, weights), pose.nan_to_num()
+        weights, pose = whole_rows(pose, weights)
         fine = weights
         for _ in range(3):
             values = self.fitted_frames(joints, self.frame(pose), fine)

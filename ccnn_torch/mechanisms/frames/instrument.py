@@ -1,8 +1,10 @@
-"""A mechanism seen through an instrument: a camera, a wire, a dial gauge, a level or a second encoder on it."""
+"""A mechanism seen through instruments: tracker, camera, wire, gauge, level, second encoder, in rows of any of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,64 +12,184 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.frames.fit import fit_frames
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form, fit_frames
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.frames.partial import Seen
-from ccnn_torch.mechanisms.frames.readings import Place, Reading, make_reading
+from ccnn_torch.mechanisms.frames.readings import READINGS, Place, Pose, Reading, make_reading
 from ccnn_torch.mechanisms.frames.set_ups import fit_set_ups
 from ccnn_torch.mechanisms.machines.links import compose
-from ccnn_torch.mechanisms.machines.serial import SerialArm
+from ccnn_torch.mechanisms.machines.serial import FRAME, SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.mechanisms.pose import Frame
+from ccnn_torch.mechanisms.pose import Frame, PoseError, frame_gap, frame_jacobian
+from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 # Rounds in which rows that are gross outliers are left out of the fit of what is unknown.
 _ROUNDS = 3
+# Plausible error of where something is on the hand or in space, after a closed form [m], [rad].
+_THERE = {"m": 0.02, "rad": 0.05}
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of the instruments on a machine.
+
+    Attributes:
+        reading: what it reads.
+        link: number of the link that holds it, 0 = the base; None = the tool or platform.
+        name: in front of its columns and parameters, where there are two of a kind.
+        place: what is unknown of its place: `point` (of its own on the hand), `camera` (that, and the board's).
+    """
+
+    reading: Reading
+    link: int | None = None
+    name: str = ""
+    place: str = ""
+
+    def called(self, name: str) -> str:
+        """A column or parameter of it."""
+        return f"{self.name}.{name}" if self.name else name
+
+    @property
+    def frames(self) -> tuple[Parameter, ...]:
+        """Parameters of its place, behind those of its reading."""
+        kind = self.reading.kind
+        parts = {"": {}, "point": {f"{kind}point": 3}, "camera": {"mount": 6, "stand": 6}}[self.place]
+        return tuple(Parameter(f"{n}_{c}", u, 0.0, scale=_THERE[u]) for n, k in parts.items() for c, u in FRAME[:k])
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """All of its own."""
+        return tuple(replace(p, name=self.called(p.name)) for p in (*self.reading.parameters, *self.frames))
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Beginnings of the names of those that are fitted first."""
+        own = dict.fromkeys(p.name.partition("_")[0] for p in self.frames)
+        return tuple(self.called(name) for name in (*self.reading.unknown, *own))
+
+    @property
+    def blind(self) -> tuple[str, ...]:
+        """Frames of an arm that it never shows."""
+        return self.reading.blind if self.link is None else ("tool",)
+
+    def __call__(self, there: Place, own: Tensor, given: Tensor) -> Tensor:
+        """What it reads, `... x c` [SI]; own: its parameters `... x m`."""
+        count = len(self.reading.parameters)
+        own, frames = own[..., :count], own[..., count:]
+        position, rotation = there.position, there.rotation
+        if self.place:
+            assert rotation is not None
+            mount = frames[..., :3]
+            position = position + (rotation @ mount[..., None])[..., 0]
+        if self.place == "camera":
+            assert rotation is not None
+            back = rotation_vector_to_matrix(frames[..., 9:12]).mT
+            rotation = back @ rotation @ rotation_vector_to_matrix(frames[..., 3:6])
+            position = (back @ (position - frames[..., 6:9])[..., None])[..., 0]
+        second = there.second
+        if second is not None and there.turned is not None and self.place:
+            second = second + (there.turned @ mount[..., None])[..., 0]
+        return self.reading(there._replace(position=position, rotation=rotation, second=second), own, given)
+
+    def start(self, there: Place, rows: Tensor, own: Tensor) -> Tensor:
+        """Its parameters near those that suit rows `s x (c + g)` in which it read."""
+        count = len(self.reading.parameters)
+        found = own.clone()
+        if self.place == "camera":
+            stands, poses = self.reading.frames(there.joints, rows, own[:count])
+            assert poses is not None and there.rotation is not None
+            first = torch.stack([(there.joints == q).all(-1).double().argmax() for q in stands])
+            pose = poses[:, :3], rotation_vector_to_matrix(poses[:, 3:])
+            held = there.rotation[first], there.position[first], pose, torch.zeros(6, dtype=own.dtype)
+            frames = best_closed_form(*held, torch.ones(len(poses), dtype=own.dtype), ROTATION_WEIGHT)
+            turn = rotation_vector_to_matrix(frames[3:6])
+            back = [-(turn.mT @ frames[:3]), -frames[3:6]]
+            found[count:] = torch.cat([frames[6:], *back])
+        found[:count] = self.reading.start(there, rows, own[:count])
+        return found
 
 
 class Instrument(Seen):
-    """A mechanism whose pose is what an instrument reads, and after it what the instrument was pointed at.
+    """A mechanism whose pose is what instruments read, side by side, and after it what they were pointed at.
 
     The second part (a corner of a board, the number of an anchor) is given with each row and never compared: forward
     kinematics take it from `guess`, which is the row as it was recorded, and return it as it is. Parameters are the
-    mechanism's, then the instrument's. What is read counts as a position along x, y, z of `frame` (lengths) or as a
-    rotation vector (angles).
+    mechanism's, then those of each instrument. Readings stand for the position of `frame`, lengths and angles alike;
+    the orientation that a tracker sees is its rotation.
 
     Attributes:
-        reading: the instrument.
-        link: number of the link that holds it, 0 = the base; None = the tool or platform.
+        parts: the instruments; one that reads orientations is the last.
     """
 
-    def __init__(self, mechanism: Mechanism, reading: Reading, link: int | None = None) -> None:
+    def __init__(self, mechanism: Mechanism, *parts: Part) -> None:
         """See the class.
 
         Raises:
-            InputError: a link that there is not, or an instrument that needs an orientation on a machine without one.
+            InputError: a link that there is not, two instruments alike, or one that needs an orientation on a machine
+                without one.
         """
+        self._check_links(mechanism, parts)
+        parts = tuple(sorted(parts, key=lambda part: isinstance(part.reading, Pose) and part.reading.turns))
+        read = [Coordinate(part.called(c.name), c.unit) for part in parts for c in part.reading.read]
+        given = [Coordinate(part.called(c.name), c.unit) for part in parts for c in part.reading.given]
+        own = [p for part in parts for p in part.parameters]
+        for names in ([c.name for c in (*read, *given)], [p.name for p in own]):
+            twice = next((name for name in names if names.count(name) > 1), None)
+            if twice is not None:
+                raise InputError(
+                    f"instruments: two have {twice!r}; give one of them a name, which stands in front of its columns "
+                    f"and parameters: name: second for second.{twice}"
+                )
+        usual = torch.tensor([v for part in parts for v in part.reading.usual], dtype=torch.float64)
+        start = torch.tensor([p.nominal for p in own], dtype=torch.float64)
+        turned = _has_orientation(mechanism)
+        blind = next((p.reading.kind for p in parts if (p.reading.turns or p.place) and not turned), None)
+        if blind is not None:
+            raise InputError(f"mechanism '{mechanism.name}' has no orientation, which a {blind} on it needs")
+        home = _all_read(parts, mechanism, mechanism.home_joints, mechanism.nominal, start, usual)
+        super().__init__(mechanism, [*read, *given], [*home.tolist(), *usual.tolist()], own)
+        self.parts, self.known, self._only_twice = parts, False, False
+
+    @staticmethod
+    def _check_links(mechanism: Mechanism, parts: Sequence[Part]) -> None:
         links = len(mechanism.joints)
-        if link is not None and not (isinstance(mechanism, SerialArm) and 0 <= link <= links):
-            what = (
-                f"write 0 to {links}" if isinstance(mechanism, SerialArm) else "only a serial arm has links; remove it"
-            )
-            raise InputError(f"link: {link} is no link of {mechanism.name}; {what}")
-        if link is not None and not reading.on_links:
-            raise InputError(f"link: how a {reading.kind} sits on a link has no parameters; only a level may be on one")
-        own = torch.tensor([p.nominal for p in reading.parameters], dtype=torch.float64)
-        usual = torch.tensor(reading.usual, dtype=torch.float64)
-        at_home = _place(mechanism, link, reading, mechanism.home_joints, mechanism.nominal, usual)
-        if reading.turns and at_home.rotation is None:
-            raise InputError(f"mechanism '{mechanism.name}' has no orientation, which a {reading.kind} on it needs")
-        home = [*reading(at_home, own, usual).tolist(), *reading.usual]
-        super().__init__(mechanism, [*reading.read, *reading.given], home, reading.parameters)
-        self.reading, self.link, self.known = reading, link, False
+        for link, reading in ((part.link, part.reading) for part in parts if part.link is not None):
+            if not (isinstance(mechanism, SerialArm) and 0 <= link <= links):
+                arm = isinstance(mechanism, SerialArm)
+                what = f"write 0 to {links}" if arm else "only a serial arm has links; remove it"
+                raise InputError(f"link: {link} is no link of {mechanism.name}; {what}")
+            if not reading.on_links:
+                raise InputError(
+                    f"link: how a {reading.kind} sits on a link has no parameters; only a level may be on one"
+                )
+
+    @property
+    def note(self) -> str:
+        """What a reader of results has to know; empty where nothing."""
+        return " ".join(part.reading.note for part in self.parts if part.reading.note)
 
     @property
     def compared(self) -> int:
         """How many coordinates are read; the rest are given."""
-        return len(self.reading.read)
+        return sum(len(part.reading.read) for part in self.parts)
+
+    @property
+    def _turns(self) -> bool:
+        """Whether the last three readings are an orientation."""
+        last = self.parts[-1].reading
+        return isinstance(last, Pose) and last.turns
+
+    @property
+    def channels(self) -> tuple[Coordinate, ...]:
+        """The readings; lengths of no name where these are fewer than three."""
+        read = self.pose[: self.compared]
+        plain, turns = (read[:-3], read[-3:]) if self._turns else (read, ())
+        return (*plain, *[Coordinate("", "m")] * (3 - len(plain)), *turns)
 
     @property
     def unknown_frames(self) -> tuple[str, ...]:
@@ -75,8 +197,8 @@ class Instrument(Seen):
         if self.known:
             return ()
         unknown: tuple[str, ...] = getattr(self.mechanism, "unknown_frames", ())
-        blind = self.reading.blind if self.link is None else ("tool",)
-        return (*(name for name in unknown if name not in blind), *self.reading.unknown)
+        shown = [name for name in unknown if not all(name in part.blind for part in self.parts)]
+        return (*shown, *(name for part in self.parts for name in part.unknown))
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
         """As of a mechanism; nothing is unknown any more where values are not those that it was made with."""
@@ -86,76 +208,164 @@ class Instrument(Seen):
         )
 
     def _own_file(self) -> dict[str, Any]:
-        keys = {"mechanism": self.mechanism.describe(), "kind": self.reading.kind, **self.reading.keys}
-        return {"spec": "instrument", "keys": keys if self.link is None else {**keys, "link": self.link}}
+        keys: dict[str, Any] = {"mechanism": self.mechanism.describe()}
+        each = []
+        for part in self.parts:
+            own = {"kind": part.reading.kind, **part.reading.keys}
+            own |= {} if part.link is None else {"link": part.link}
+            own |= {"name": part.name} if part.name else {}
+            each.append(own | ({"own_point": True} if part.place == "point" else {}))
+        return {"spec": "instrument", "keys": keys | (each[0] if self.alone else {"instruments": each})}
+
+    @property
+    def alone(self) -> bool:
+        """Whether it is one instrument, whose place is the tool frame."""
+        return len(self.parts) == 1 and not self.parts[0].place and not self.parts[0].name
 
     def around(self, mechanism: Mechanism) -> Instrument:
-        """The same instrument, with its parameters, on another machine."""
-        found = Instrument(mechanism, self.reading, self.link)
+        """The same instruments, with their parameters, on another machine."""
+        found = Instrument(mechanism, *self.parts)
         return found.with_nominal(torch.cat([mechanism.nominal, self.nominal[len(self.mechanism.geometry) :]]))  # type: ignore[return-value]
+
+    def shown_by(self, names: Sequence[str]) -> Instrument | None:
+        """With the instruments of whose readings there are columns, where these are some of several."""
+        there = [part for part in self.parts if any(part.called(c.name) in names for c in part.reading.read)]
+        if not 0 < len(there) < len(self.parts):
+            return None
+        fewer = Instrument(self.mechanism, *there)
+        values = dict(zip((p.name for p in self.geometry), self.nominal.tolist(), strict=True))
+        fewer.set_parameters({p.name: values[p.name] for p in fewer.geometry})
+        return fewer if [c.name for c in fewer.pose] == [*names] else None
 
     def forward_kinematics(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
         """What is read with these joints, and what is given by `guess` (home without), `... x p` [SI]."""
-        there, own, given = self._rows(joints, parameters, guess)
-        read = self.reading(there, own, given)
+        values, count, given = self.resolve(parameters), len(self.mechanism.geometry), self.given(guess)
+        read = _all_read(self.parts, self.mechanism, joints, values[..., :count], values[..., count:], given)
+        if self._only_twice:
+            twice = [part.reading.twice for part in self.parts for _ in part.reading.read]
+            read = torch.where(torch.tensor(twice), read, 0.0)
         return torch.cat([read, given.expand(*read.shape[:-1], -1)], -1)
-
-    def _rows(self, joints: Tensor, parameters: Tensor | None, guess: Tensor | None) -> tuple[Place, Tensor, Tensor]:
-        """Where what holds the instrument is, the instrument's own parameters, and what is given."""
-        values, count = self.resolve(parameters), len(self.mechanism.geometry)
-        given = self.given(guess)
-        there = _place(self.mechanism, self.link, self.reading, joints, values[..., :count], given)
-        return there, values[..., count:], given
 
     def given(self, rows: Tensor | None) -> Tensor:
         """What the rows `... x p` were of, `... x g` [SI]; what is usual where there are none."""
         return (self.home_pose if rows is None else rows)[..., self.compared :]
 
+    def _second(self) -> slice | None:
+        """Of all columns the joints of the second place; None where rows have one place."""
+        first = self.compared
+        for part in self.parts:
+            if part.reading.twice:
+                return slice(first, first + len(self.joints))
+            first += len(part.reading.given)
+        return None
+
     def places(self, joints: Tensor, rows: Tensor | None) -> list[Tensor]:
         """Of rows whose reading is of two places, both."""
-        return [joints, self.given(rows).expand_as(joints)] if self.reading.twice else [joints]
+        second = self._second()
+        if second is None:
+            return [joints]
+        there = (self.home_pose if rows is None else rows)[..., second].expand_as(joints)
+        # A row without a second place shows nothing of it.
+        return [joints, torch.where(there.isnan(), joints, there)]
+
+    def with_second(self, rows: Tensor, joints: Tensor) -> Tensor:
+        """Rows `... x p` with other joints `... x n` of the second place."""
+        second = self._second()
+        assert second is not None
+        return torch.cat([rows[..., : second.start], joints, rows[..., second.stop :]], -1)
+
+    def elsewhere(self) -> Instrument:
+        """As what is read changes with the second place, given as the first: nothing else does."""
+        twin = copy.copy(self)
+        twin._only_twice = True
+        return twin
 
     def sample_given(self, count: int, generator: torch.Generator) -> Tensor:
         """Rows of any anchor, plane or second place, `count x p` [SI]; nothing is read yet."""
-        rows, groups = self.home_pose.expand(count, -1), torch.tensor(self.reading.groups, dtype=torch.float64)
-        if self.reading.twice:
-            given = self.mechanism.sample_joints(count, generator)
-        elif len(groups):
-            given = groups[torch.randint(len(groups), (count, 1), generator=generator)]
-        else:
-            return rows
-        return torch.cat([rows[:, : self.compared], given], -1)
+        columns = [self.home_pose[: self.compared].expand(count, -1)]
+        for reading in (part.reading for part in self.parts):
+            groups = torch.tensor(reading.groups, dtype=torch.float64)
+            if reading.twice:
+                columns.append(self.mechanism.sample_joints(count, generator))
+            elif len(groups):
+                columns.append(groups[torch.randint(len(groups), (count, 1), generator=generator)])
+            else:
+                columns.append(torch.tensor(reading.usual, dtype=torch.float64).expand(count, -1))
+        return torch.cat(columns, -1)
 
     def frame(self, pose: Tensor) -> Frame:
-        """What is read: lengths as a position, angles as a rotation vector."""
+        """What is read, `... x c`, but an orientation, which is the rotation."""
         read = pose[..., : self.compared]
-        read = torch.nn.functional.pad(read, (0, 3 - self.compared))
-        if self.pose[0].unit == "m":
-            return read, None
-        return torch.zeros_like(read), rotation_vector_to_matrix(read)
+        plain = read[..., :-3] if self._turns else read
+        plain = torch.nn.functional.pad(plain, (0, max(0, 3 - plain.shape[-1])))
+        return plain, rotation_vector_to_matrix(read[..., -3:]) if self._turns else None
+
+    def pose_error(self, measured: Tensor, reference: Tensor) -> PoseError:
+        """Over the lengths [m] and over the angles [rad] that were read; NaN where none was."""
+        here, there = (torch.where(pose.isnan(), 0.0, pose) for pose in (measured, reference))
+        gap = frame_gap(self.frame(here), self.frame(there), 1.0)
+        known = ~(measured.isnan() | reference.isnan())[..., : self.compared]
+        units = [c.unit for c in self.pose[: self.compared]]
+        padded = [k for k, c in enumerate(self.channels) if c.name]
+        gap = torch.where(known, gap[..., padded], 0.0)
+        sizes = []
+        for unit in ("m", "rad"):
+            mine = [k for k, u in enumerate(units) if u == unit]
+            size = gap[..., mine].norm(dim=-1)
+            sizes.append(torch.where(known[..., mine].any(-1), size, torch.nan) if mine else size)
+        return PoseError(sizes[0], sizes[1] if "rad" in units else None)
+
+    def singular_values(
+        self,
+        joints: Tensor,
+        rotation_weight: float = 0.04,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+    ) -> Tensor:
+        """The largest alone: readings that show the same are no singularity."""
+        return super().singular_values(joints, rotation_weight, parameters, guess)[..., :1]
 
     def by_place(self, joints: Tensor, parameters: Tensor | None, guess: Tensor | None) -> Tensor:
-        """Change of `frame` by a shift and a turn (about its own point) of what holds the instrument, `... x c x 6`."""
-        there, own, given = self._rows(joints, parameters, guess)
+        """Change of `frame` by a shift and a turn (about its own point) of what holds them, `... x c x 6`."""
+        values, count, given = self.resolve(parameters), len(self.mechanism.geometry), self.given(guess)
 
-        def read(twist: Tensor) -> Tensor:
-            turned = there.rotation
-            if turned is not None:
-                turned = rotation_vector_to_matrix(twist[..., 3:]) @ turned
-            return self.reading(there._replace(position=there.position + twist[..., :3], rotation=turned), own, given)
+        def read(twist: Tensor) -> Frame:
+            every = self.parts, self.mechanism, joints, values[..., :count], values[..., count:], given, twist
+            return self.frame(_all_read(*every))
 
-        slope = jacobian_of(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype))[1]
-        slope = torch.nn.functional.pad(slope, (0, 0, 0, 3 - self.compared))
-        return slope if self.pose[0].unit == "m" else torch.cat([torch.zeros_like(slope), slope], -2)
+        return frame_jacobian(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype))
+
+    def _rows_of(self, rows: Tensor) -> list[Tensor]:
+        """What each instrument read and was pointed at, `s x (c + g)` each."""
+        found, read, given = [], 0, self.compared
+        for reading in (part.reading for part in self.parts):
+            ends = read + len(reading.read), given + len(reading.given)
+            found.append(torch.cat([rows[:, read : ends[0]], rows[:, given : ends[1]]], -1))
+            read, given = ends
+        return found
+
+    def noise_groups(self) -> list[int]:
+        """Of each reading which of them have one noise: those of one instrument in one unit."""
+        every = [(i, c.unit) for i, part in enumerate(self.parts) for c in part.reading.read]
+        return [[*dict.fromkeys(every)].index(one) for one in every]
+
+    @property
+    def given_of(self) -> dict[str, list[str]]:
+        """Columns of what an instrument was pointed at, and those of its readings that need them."""
+        return {
+            part.called(given.name): [part.called(c.name) for c in part.reading.read]
+            for part in self.parts
+            for given in part.reading.given
+        }
 
     def fitted(self, joints: Tensor, pose: Tensor, weights: Tensor | None = None) -> Tensor:
         """All parameters, those of `unknown_frames` fitted to rows, the rest nominal.
 
         Args:
             joints: `s x n` [SI].
-            pose: readings and what they are of, `s x p` [SI].
+            pose: readings and what they are of, `s x p` [SI]; NaN where not measured.
             weights: `... x s`, 0 leaves a row out.
 
         Returns:
@@ -165,57 +375,135 @@ class Instrument(Seen):
             InputError: too few rows.
         """
         weights = torch.ones(len(joints), dtype=torch.float64) if weights is None else weights
-        flat = [self._fitted_to(joints, pose, w) for w in weights.reshape(-1, len(joints))]
+        flat = [self._fitted_to(joints, pose, w, self.unknown_frames) for w in weights.reshape(-1, len(joints))]
         return torch.stack(flat).reshape(*weights.shape[:-1], -1)
 
-    def _fitted_to(self, joints: Tensor, pose: Tensor, weights: Tensor) -> Tensor:
-        start = self.nominal.clone()
-        count = len(self.mechanism.geometry)
-        unknown = self.unknown_frames
+    def placed(self, joints: Tensor, pose: Tensor) -> Instrument:
+        """Itself where the instruments stand as suits rows best, the machine, its frames and a lens as they are."""
+        lens = [name for part in self.parts if part.reading.looks for name in map(part.called, part.reading.unknown)]
+        own = (name for part in self.parts for name in part.unknown)
+        unknown = () if self.known else tuple(name for name in own if name not in lens)
+        weights = torch.ones(len(joints), dtype=torch.float64)
+        return self.with_nominal(self._fitted_to(joints, pose, weights, unknown))  # type: ignore[return-value]
+
+    def _fitted_to(self, joints: Tensor, pose: Tensor, weights: Tensor, unknown: Sequence[str]) -> Tensor:
         free = [k for k, g in enumerate(self.geometry) if g.name.partition("_")[0] in unknown]
-        used = (weights > 0) & ~pose.isnan().any(-1)
+        used = (weights > 0) & ~pose[:, : self.compared].isnan().all(-1)
         if not free:
-            return start
-        if int(used.sum()) * self.compared < len(free):
-            raise InputError(
-                f"{self.name}: {int(used.sum())} rows of {self.compared} readings cannot determine where the "
-                f"{self.reading.kind} is ({len(free)} unknowns); measure more"
-            )
+            return self.nominal.clone()
         q, x = joints[used], pose[used]
-        arm = self.mechanism
-        if isinstance(arm, SerialArm) and arm.unknown_frames:
-            stands, poses = self.reading.frames(q, x, start[count:])
-            if poses is not None:
-                start[:count] = fit_frames(arm, stands, poses)
-        there = _place(arm, self.link, self.reading, q, start[:count], self.given(x))
-        start[count:] = self.reading.start(there, x, start[count:])
-        kept = torch.ones(len(q), dtype=torch.float64)
+        seen = ~x[:, : self.compared].isnan()
+        if int(seen.sum()) < len(free):
+            kinds = ", ".join(part.reading.kind for part in self.parts)
+            raise InputError(
+                f"{self.name}: {int(used.sum())} rows with {int(seen.sum())} readings cannot determine where the "
+                f"{kinds} {'is' if len(self.parts) == 1 else 'are'} ({len(free)} unknowns); measure more"
+            )
+        start = self._begun(q, x, unknown)
+        x = torch.where(x.isnan(), self.home_pose, x)
+        group = torch.tensor(self.noise_groups())
+        groups = torch.nn.functional.one_hot(group).double()
+        kept, scale = torch.ones(len(q), dtype=torch.float64), torch.ones(self.compared, dtype=torch.float64)
         for _ in range(_ROUNDS):
 
-            def gap(values: Tensor, kept: Tensor = kept, start: Tensor = start) -> Tensor:
+            def gap(values: Tensor, kept: Tensor = kept, start: Tensor = start, scale: Tensor = scale) -> Tensor:
                 full = start.expand(*values.shape[:-1], -1).index_copy(-1, torch.tensor(free), values)
-                left = self.forward_kinematics(q, full, x) - x
-                return left[:, : self.compared] * kept[:, None]
+                return torch.where(seen, self._left(q, full, x), 0.0) / scale * kept[:, None]
 
+            if groups.shape[-1] > 1:
+                # Readings of different kinds weigh as they scatter.
+                left = gap(start[free]) * scale
+                size = (left.square() @ groups).sum(0) / (seen.double() @ groups).sum(0).clamp_min(1)
+                scale = (groups @ size.sqrt()).clamp_min(1e-12)
             found = levenberg_marquardt(
-                lambda v, gap=gap: gap(v).flatten(),
+                lambda v, gap=gap, scale=scale: gap(v, scale=scale).flatten(),
                 start[free],
                 # A row's residual is of its own copy of the values: one pass for each reading and not for each row.
-                lambda v, gap=gap: jacobian_of(gap, v.expand(len(q), -1))[1].flatten(0, 1),
+                lambda v, gap=gap, scale=scale: jacobian_of(lambda at: gap(at, scale=scale), v.expand(len(q), -1))[
+                    1
+                ].flatten(0, 1),
                 max_iterations=100,
             )
             start = start.index_copy(0, torch.tensor(free), found.value)
-            left = self.forward_kinematics(q, start, x)[:, : self.compared] - x[:, : self.compared]
-            kept = inlying(left.norm(dim=-1).nan_to_num(nan=torch.inf), kept >= 0, self.compared, len(free)).double()
+            left = torch.where(seen, self._left(q, start, x), 0.0) / scale
+            length = left.norm(dim=-1) * (self.compared / seen.sum(-1)).sqrt()
+            kept = inlying(length.nan_to_num(nan=torch.inf), kept >= 0, self.compared, len(free)).double()
         return start
 
+    def _left(self, joints: Tensor, values: Tensor, rows: Tensor) -> Tensor:
+        """From what was read to what these parameters say, `s x c`."""
+        gap = frame_gap(self.frame(self.forward_kinematics(joints, values, rows)), self.frame(rows), 1.0)
+        return gap[..., [k for k, c in enumerate(self.channels) if c.name]]
 
-def _place(
-    mechanism: Mechanism, link: int | None, reading: Reading, joints: Tensor, values: Tensor, given: Tensor
-) -> Place:
+    def _begun(self, joints: Tensor, rows: Tensor, unknown: Sequence[str]) -> Tensor:
+        """All parameters near those that suit rows, from closed forms."""
+        start, arm, first = self.nominal.clone(), self.mechanism, len(self.mechanism.geometry)
+        own = torch.split(start[first:], [len(part.parameters) for part in self.parts])
+        each = []
+        for part, mine in zip(self.parts, self._rows_of(rows), strict=True):
+            whole = ~mine.isnan().any(-1)
+            each.append((part, joints[whole], mine[whole]))
+        if isinstance(arm, SerialArm) and {*arm.unknown_frames} & {*unknown}:
+            for (part, q, mine), values in zip(each, own, strict=True):
+                stands, poses = (q, None) if part.place else part.reading.frames(q, mine, values)
+                if poses is not None:
+                    shown = arm if poses.shape[-1] == len(arm.pose) else arm.with_orientation("none")
+                    start[:first] = fit_frames(shown, stands, poses)
+                    break
+        found = [start[:first]]
+        for (part, q, mine), values in zip(each, own, strict=True):
+            given = mine[:, len(part.reading.read) :]
+            found.append(part.start(_place(arm, part, q, start[:first], given), mine, values))
+        return torch.cat(found)
+
+
+def _has_orientation(mechanism: Mechanism) -> bool:
+    """Whether the tool or platform has one, also where only its position is measured."""
+    return isinstance(mechanism, SerialArm) or mechanism.frame(mechanism.home_pose)[1] is not None
+
+
+def _all_read(
+    parts: Sequence[Part],
+    mechanism: Mechanism,
+    joints: Tensor,
+    values: Tensor,
+    own: Tensor,
+    given: Tensor,
+    twist: Tensor | None = None,
+) -> Tensor:
+    """What the instruments read, side by side, `... x c` [SI].
+
+    Args:
+        values: of the mechanism, `... x k`.
+        own: of the instruments, `... x m`.
+        given: what they were pointed at, `... x g`.
+        twist: shift and turn of what holds them, `... x 6`.
+    """
+    read, first, second = [], 0, 0
+    for part in parts:
+        ends = first + len(part.parameters), second + len(part.reading.given)
+        here = given[..., second : ends[1]]
+        there = _place(mechanism, part, joints, values, here)
+        if twist is not None:
+            turned = there.rotation
+            if turned is not None:
+                turned = rotation_vector_to_matrix(twist[..., 3:]) @ turned
+            there = there._replace(position=there.position + twist[..., :3], rotation=turned)
+        read.append(part(there, own[..., first : ends[0]], here))
+        first, second = ends
+    if len(read) == 1:
+        return read[0]
+    lead = leading_shape(*read)
+    return torch.cat([one.expand(*lead, -1) for one in read], -1)
+
+
+def _place(mechanism: Mechanism, part: Part, joints: Tensor, values: Tensor, given: Tensor) -> Place:
     """Where what holds an instrument is, also with the joints that are given where its reading is of two places."""
-    there = place_of(mechanism, link, joints, values)
-    return there._replace(second=place_of(mechanism, link, given, values).position) if reading.twice else there
+    there = place_of(mechanism, part.link, joints, values)
+    if not part.reading.twice:
+        return there
+    other = place_of(mechanism, part.link, given, values)
+    return there._replace(second=other.position, turned=other.rotation)
 
 
 def place_of(mechanism: Mechanism, link: int | None, joints: Tensor, values: Tensor) -> Place:
@@ -249,15 +537,27 @@ def fit_unknown(
     return mechanism.fitted(joints, pose, weights)
 
 
-def instrument(
-    mechanism: Mechanism, kind: str, link: int | None = None, keys: Mapping[str, Any] | None = None
-) -> Instrument:
-    """A mechanism with an instrument of this kind.
+def instrument(mechanism: Mechanism, instruments: Sequence[Mapping[str, Any]]) -> Instrument:
+    """A mechanism with instruments.
 
     Args:
-        keys: of the instrument, see `READINGS`.
+        instruments: of each its `kind`, its keys (see `READINGS`), and `link`, `name` or `own_point`.
 
     Raises:
-        InputError: a kind or key that is not known.
+        InputError: none, a kind or key that is not known, or no list of these.
     """
-    return Instrument(mechanism, make_reading(kind, keys or {}, mechanism), link)
+    if isinstance(instruments, str | Mapping) or not instruments:
+        raise InputError("instruments: write a list, e.g. [{kind: wire, anchors: 2}, {kind: level}, {kind: pose}]")
+    parts = []
+    for about in instruments:
+        if not isinstance(about, Mapping) or not isinstance(about.get("kind"), str):
+            raise InputError(f"instruments: {about!r} has no kind; write one of {', '.join(READINGS)}")
+        keys = {k: v for k, v in about.items() if k not in ("kind", "link", "name", "own_point")}
+        reading = make_reading(about["kind"], keys, mechanism)
+        camera = reading.looks and len(instruments) > 1
+        if camera:
+            # What it does not look at in a row must not spoil the row.
+            reading.behind = 1.0
+        place = "camera" if camera else "point" if about.get("own_point") else ""
+        parts.append(Part(reading, about.get("link"), str(about.get("name") or ""), place))
+    return Instrument(mechanism, *parts)

@@ -71,13 +71,17 @@ class Seen(Around, ABC):
         """A whole pose of the mechanism inside near one that shows this, `... x p'` [SI]; None where nothing says."""
         return None
 
+    def shown_by(self, names: Sequence[str]) -> Seen | None:
+        """As columns of these names alone show it, where that is another way of seeing; else None."""
+        return None
+
     @abstractmethod
     def around(self, mechanism: Mechanism) -> Seen:
         """Another mechanism seen in the same way."""
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 6` or `x 3`."""
-        return frame_gap(self.frame(self.forward_kinematics(joints, parameters, pose)), self.frame(pose), 1.0)
+        return self._gap(joints, self.resolve(parameters), pose, 1.0)
 
     def controlled(self) -> Mechanism:
         """As of the mechanism inside."""
@@ -96,8 +100,7 @@ class Seen(Around, ABC):
         values = self.resolve(parameters)
         found = self.nearest_joints(pose, values, guess, _ROTATION_WEIGHT)
         slope = self._slope(found, values, pose, _ROTATION_WEIGHT)
-        gap = frame_gap(self.frame(self.forward_kinematics(found, values, pose)), self.frame(pose), _ROTATION_WEIGHT)
-        return carry_derivative(found, slope, gap)
+        return carry_derivative(found, slope, self._gap(found, values, pose, _ROTATION_WEIGHT))
 
     def nearest_joints(
         self,
@@ -112,7 +115,7 @@ class Seen(Around, ABC):
         anchor = expand_leading(self.home_joints if guess is None else guess, pose, values).detach()
 
         def gap(q: Tensor, v: Tensor, x: Tensor) -> Tensor:
-            return frame_gap(self.frame(self.forward_kinematics(q, v, x)), self.frame(x), rotation_weight)
+            return self._gap(q, v, x, rotation_weight)
 
         def slope(q: Tensor, v: Tensor, x: Tensor) -> Tensor:
             return self._slope(q, v, x, rotation_weight)
@@ -141,9 +144,12 @@ class Seen(Around, ABC):
     def _slope(self, joints: Tensor, values: Tensor, pose: Tensor, rotation_weight: float) -> Tensor:
         """The Jacobian with its rotation rows weighed, 0 where there is no pose."""
         rows = torch.nan_to_num(self.jacobian(joints, values, pose))
-        weight = torch.ones(rows.shape[-2], 1, dtype=rows.dtype)
-        weight[3:] = rotation_weight
-        return rows * weight
+        return rows * self.channel_weights(rotation_weight)[:, None]
+
+    def _gap(self, joints: Tensor, values: Tensor, pose: Tensor, rotation_weight: float) -> Tensor:
+        """From the pose to that of the joints, weighed alike."""
+        gap = frame_gap(self.frame(self.forward_kinematics(joints, values, pose)), self.frame(pose), 1.0)
+        return gap * self.channel_weights(rotation_weight)
 
 
 class Partial(Seen):
@@ -241,6 +247,9 @@ def as_measured(
             return looking
     if names == whole or not set(names) < set(whole):
         return mechanism
+    fewer = mechanism.shown_by(names) if isinstance(mechanism, Seen) else None
+    if fewer is not None:
+        return fewer
     if isinstance(mechanism, SerialArm) and names == ["x", "y", "z"]:
         return mechanism.with_orientation("none")
     unknown = getattr(mechanism, "unknown_frames", ())

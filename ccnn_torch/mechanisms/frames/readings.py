@@ -15,8 +15,9 @@ from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.board import board_poses
 from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.mechanisms.pose import CHANNELS
 from ccnn_torch.numerics.batching import expand_leading
-from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
 
 # Plausible errors: of a focal length and an image's centre as a share of it, of distortion, of a place that a tape
@@ -28,6 +29,8 @@ PIXEL = 1e-6
 _LENS = 6
 # Rows of an anchor or a plane.
 _FEWEST = 4
+# Poses from which frames are fitted in closed form.
+_POSES = 5
 # Nothing is seen nearer to a camera than this [m].
 _BEHIND = 1e-3
 
@@ -35,13 +38,14 @@ _BEHIND = 1e-3
 class Place(NamedTuple):
     """Position `... x 3` [m] and rotation `... x 3 x 3` (or None) of what holds the instrument, joints `... x n`.
 
-    second: the position with the joints that are given, `... x 3` [m], where the reading is of two places.
+    second, turned: position and rotation with the joints that are given, where the reading is of two places.
     """
 
     position: Tensor
     rotation: Tensor | None
     joints: Tensor
     second: Tensor | None = None
+    turned: Tensor | None = None
 
 
 class Reading(ABC):
@@ -55,16 +59,20 @@ class Reading(ABC):
         twice: whether it is of two places of one machine, alike in both; the joints of the second are given.
         blind: frames of an arm that it never shows.
         groups: numbers of its anchors or planes in the column that is given.
-        read: what it reads; all lengths or all angles, three at most.
+        read: what it reads.
         given: what it was pointed at, columns of the records.
         usual: of what is given, where no row says it [SI].
         parameters: its own.
         unknown: beginnings of the names of those of them that are fitted before anything else.
         note: what a reader of results has to know; empty where nothing.
+        looks: whether it shows something that stands, whose place is unknown, too, as that of the instrument is.
+        behind: depth that counts for what is behind it [m]; NaN where such a row cannot be.
     """
 
     kind = ""
     note = ""
+    looks = False
+    behind: float = torch.nan
     turns = False
     on_links = False
     twice = False
@@ -99,6 +107,7 @@ class Camera(Reading):
     """
 
     kind = "camera"
+    looks = True
     note = "A pixel counts as 1 µm on the image: every µm of a position here is a pixel."
     turns = True
     read = (Coordinate("u", "m"), Coordinate("v", "m"))
@@ -155,7 +164,7 @@ class Camera(Reading):
             seen = (place.rotation @ point[..., None])[..., 0] + place.position
         fx, fy, cx, cy, k1, k2 = own[..., :_LENS].unbind(-1)
         deep = seen[..., 2]
-        ratio = seen[..., :2] / torch.where(deep > _BEHIND, deep, torch.nan)[..., None]
+        ratio = seen[..., :2] / torch.where(deep > _BEHIND, deep, self.behind)[..., None]
         square = ratio.square().sum(-1)
         wide = 1 + k1 * square + k2 * square.square()
         return torch.stack([fx * ratio[..., 0] * wide + cx, fy * ratio[..., 1] * wide + cy], -1)
@@ -313,7 +322,44 @@ class Encoder(Reading):
         return place.joints[..., self.number : self.number + 1] + own
 
 
-READINGS: dict[str, Callable[..., Reading]] = {c.kind: c for c in (Camera, Wire, Dial, Level, Encoder, Between)}
+class Pose(Reading):
+    """What a tracker or a probe sees of the tool's pose: any of x, y, z, and all of rx, ry, rz or none."""
+
+    kind = "pose"
+    unknown = ()
+    parameters = ()
+
+    def __init__(self, mechanism: Mechanism, pose: Sequence[str] | None = None) -> None:
+        """Which coordinates there are columns of; all when None."""
+        turned = bool(mechanism.orientations) or mechanism.frame(mechanism.home_pose)[1] is not None
+        names = [c.name for c in (CHANNELS if turned else CHANNELS[:3])]
+        wanted = names if pose is None else [*pose]
+        angles = sum(name in names[3:] for name in wanted)
+        if not wanted or not set(wanted) <= set(names) or angles not in (0, 3):
+            raise InputError(
+                f"pose: write some of {', '.join(names[:3])}{', and all of rx, ry, rz or none' if turned else ''}, "
+                f"not {pose!r}"
+            )
+        self.keys = {} if pose is None else {"pose": wanted}
+        self.turns = angles > 0
+        self._seen = [k for k, name in enumerate(names) if name in wanted]
+        self.read = tuple(CHANNELS[k] for k in self._seen)
+
+    def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
+        whole = place.position
+        if self.turns:
+            assert place.rotation is not None
+            whole = torch.cat([whole, matrix_to_rotation_vector(place.rotation)], -1)
+        return whole[..., self._seen]
+
+    def frames(self, joints: Tensor, rows: Tensor, own: Tensor) -> tuple[Tensor, Tensor | None]:
+        """As measured, where positions were."""
+        there = (rows if self.turns else rows[:, :3])[:, : len(self._seen)]
+        return joints, there if self._seen[:3] == [0, 1, 2] and len(joints) >= _POSES else None
+
+
+_EVERY = (Camera, Wire, Dial, Level, Encoder, Between, Pose)
+READINGS: dict[str, Callable[..., Reading]] = {c.kind: c for c in _EVERY}
 """Instruments by name."""
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, unflatten
 
 from ccnn_torch.coordinates import Coordinate, Parameter
-from ccnn_torch.mechanisms.frames.fit import check_rows_of, groups_of
+from ccnn_torch.mechanisms.frames.fit import check_rows_of, groups_of, whole_rows
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
@@ -148,8 +148,7 @@ def fit_set_ups(
         InputError: a column that is not there, or a group with fewer than three rows.
     """
     twin, number, groups = set_ups(machine, columns, len(joints))
-    weights = torch.ones(len(joints), dtype=joints.dtype) if weights is None else weights
-    weights, pose = torch.where(pose.isnan().any(-1), 0.0, weights), pose.nan_to_num()
+    weights, pose = whole_rows(pose, weights)
     for name, rows in groups:
         check_rows_of(machine.name, name, weights[..., rows], 3)
     count = int(number.max()) + 1

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -24,6 +24,7 @@ from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.files.yaml_file import parse_yaml
+from ccnn_torch.mechanisms.machines.drives import BOW
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.spelling import nearest
@@ -36,7 +37,7 @@ KINDS = tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 _BARE = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*")
 _TOLERANCE = re.compile(r"\+-|±")
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
-_OF_ARMS = ("base_frame", "tool_frame", "limits", "orientation", "frame_per", "tool_per")
+_OF_ARMS = ("base_frame", "tool_frame", "limits", "pitch_errors", "orientation", "frame_per", "tool_per")
 _FRAME = ("m", "m", "m", "rad", "rad", "rad")
 
 
@@ -105,6 +106,8 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         (number,) = _numbers(key, entry, given, unit, 1, where)
         numbers.append(_told(entry, key, number, entry.get("same_as", "")) | {"name": key, "unit": unit})
         numbers[-1] |= {"nominal": number.value, "of": dict(entry["of"])}
+        # What is judged by itself, and not with the geometry.
+        numbers[-1] |= {"cause": entry["cause"]} if "cause" in entry else {}
     frames = {
         key: _frame(content.get(f"{key}_frame", about[f"{key}_frame"]), f"{where}: {key}_frame")
         for key in ("base", "tool")
@@ -130,9 +133,41 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         orientation=content.get("orientation", about.get("orientation", "rotation_vector")),
         frame_per=_words(content, "frame_per", where),
         tool_per=_words(content, "tool_per", where),
-        drives=[(int(d[5]), int(d[6])) for e in about["numbers"].values() for d in e["of"] if d.startswith("drive")],
+        drives=[drive for e in about["numbers"].values() for d in e["of"] for drive in _drives(d)],
         numbers=numbers,
+        tables=_tables(content, joints, moves, where),
     )
+
+
+def _drives(name: str) -> list[tuple[int, ...]]:
+    """The drive of a parameter `driveij` or `bowij`; none of another one."""
+    if name.startswith("drive"):
+        return [(int(name[5]), int(name[6]))]
+    return [(int(name[3]), int(name[4]), BOW)] if name.startswith("bow") else []
+
+
+def _tables(
+    content: Mapping[str, Any], joints: Sequence[str], moves: Sequence[Sequence[str]], where: str
+) -> list[list[list[float]] | None] | None:
+    """Places and errors of each joint's pitch-error table [SI], None of one without; None where there is none."""
+    given = content.get("pitch_errors")
+    if given is None:
+        return None
+    written = f"{where}: pitch_errors: must be as {{q1: {{at: [0 mm, 250 mm], error: [0 um, 3 um]}}}}"
+    if not isinstance(given, Mapping):
+        raise InputError(f"{written}, not {given!r}")
+    _check_names([str(key) for key in given], list(joints), f"{where}: pitch_errors:")
+    found: list[list[list[float]] | None] = []
+    for joint, (how, _) in zip(joints, moves, strict=True):
+        table, unit = given.get(joint), "rad" if how == "turn" else "m"
+        if table is None:
+            found.append(None)
+            continue
+        rows = [table.get(key) or [] for key in ("at", "error")] if isinstance(table, Mapping) else []
+        if len(rows) != 2 or not all(isinstance(row, list) for row in rows):
+            raise InputError(f"{written}, not {joint}: {table!r}")
+        found.append([[_amount(v, unit, f"{where}: pitch_errors.{joint}") for v in row] for row in rows])
+    return found
 
 
 def _words(content: Mapping[str, Any], key: str, where: str) -> list[str]:
@@ -204,7 +239,8 @@ def _numbers(
     texts = texts if isinstance(texts, list) else [texts] * count
     if len(texts) != count:
         raise InputError(f"{where}: numbers.{key}: needs one value, or a list of {count}, not {len(texts)}")
-    usual = entry.get("tolerance", 0)
+    # Of a number that a file need not have nothing is searched where it has none.
+    usual = 0 if entry.get("optional") and key not in given else entry.get("tolerance", 0)
     usual = usual if isinstance(usual, list) else [usual] * count
     found = []
     for text, own in zip(texts, usual, strict=True):
@@ -269,6 +305,8 @@ def template(kind: str) -> str:
             *(f"{key}: {_written(about[key])}" for key in ("base_frame", "tool_frame")),
             "# Travel of the joints.",
             f"limits: {{{ends}}}",
+            "# A table of pitch errors that is known (positive = it goes too far); what is found is then beyond it:",
+            "# pitch_errors: {q1: {at: [0 mm, 250 mm, 500 mm], error: [0 um, 3 um, -2 um]}}",
         ]
     lines += [
         "# Each number of the machine as drawn, and after +- its tolerance, one standard deviation; +- 0 is exact.",

@@ -14,6 +14,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.branches import commanded_joints
+from ccnn_torch.mechanisms.machines.drives import Drives
 from ccnn_torch.mechanisms.machines.links import (
     LINKS,
     SCREWS,
@@ -73,7 +74,9 @@ class SerialArm(Mechanism):
             which the tool looks, so that only lengths behind the last axis count, and a shift of the base does nothing.
         rotation_weight: [m/rad].
         drives: pairs of joints i, j (from 1): the drive of joint j moves joint i as well, by parameter driveij for each
-            unit; of i = j joint i is off by that share (lead, gear ratio).
+            unit; of i = j joint i is off by that share (lead, gear ratio). With a third number 2 it moves it by bowij
+            times a parabola over its travel (straightness).
+        own_drives: what these and the tables of pitch errors do.
     """
 
     orientations = ("rotation_vector", "quaternion", "none")
@@ -106,6 +109,7 @@ class SerialArm(Mechanism):
         drives: Sequence[Sequence[int]] = (),
         numbers: Sequence[Mapping[str, Any]] = (),
         goal_tool: Sequence[float] | None = None,
+        tables: Sequence[Sequence[Sequence[float]] | None] | None = None,
     ) -> None:
         """Build from plain numbers [SI].
 
@@ -121,6 +125,7 @@ class SerialArm(Mechanism):
             goal_tool: the tool that commanded poses are of, position and rotation vector; `tool` when None.
             limits: lowest and highest value per joint, for sampling only; a full turn or a metre when None.
             unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight, drives: see the class.
+            tables: of each joint the places and the errors of its pitch-error table there, or None.
             numbers: fields of a `Parameter`, and `of`: what one unit of it adds to links' and drives' parameters, by
                 name; `links` are then what is there without them.
 
@@ -128,7 +133,7 @@ class SerialArm(Mechanism):
             InputError: unknown convention or orientation.
         """
         keys = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        keys = keys if goal_tool else {k: v for k, v in keys.items() if k != "goal_tool"}
+        keys = {k: v for k, v in keys.items() if v is not None or k not in ("goal_tool", "tables")}
         if convention not in LINKS or orientation not in ("rotation_vector", "none", "direction"):
             raise InputError(
                 f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector', 'none' or "
@@ -179,6 +184,7 @@ class SerialArm(Mechanism):
         self.register_buffer("signs", torch.tensor(joint_sign or [1.0] * n, dtype=torch.float64))
         self.register_buffer("revolute", torch.tensor(turn))
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
+        self.own_drives = Drives(drives, span, tables or [None] * n)
         self.drives, self._named, self._links_size = tuple(map(tuple, drives)), bool(numbers), count - len(drives)
         self.register_buffer("_start", start, persistent=False)
         self.register_buffer("_shares", shares, persistent=False)
@@ -249,6 +255,8 @@ class SerialArm(Mechanism):
         """The arm of its file in its own base; at the flange where its tool is unknown. Poses have an orientation."""
         keys = self.recipe["keys"]
         known = {"base": (0.0,) * 6, "tool_offset": None, "unknown_frames": (), "orientation": "rotation_vector"}
+        # What was measured of an axis is no part of what its controller computes.
+        known["tables"] = None
         return SerialArm(**{**keys, **known, "tool": keys.get("goal_tool") or keys["tool"]})
 
     def commanded_joints(self, pose: Tensor, guess: Tensor | None = None) -> Tensor:
@@ -301,21 +309,21 @@ class SerialArm(Mechanism):
         own = values[..., 6:-6]
         return self._start + own @ self._shares if self._named else own
 
-    def coupled(self, values: Tensor) -> Tensor | None:
-        """How joints move for each unit of the commands, `... x n x n`; None where each drive moves its own by one."""
-        if not self.drives:
+    def coupled(self, joints: Tensor, values: Tensor) -> Tensor | None:
+        """How joints move for each unit of the commands `... x n`, `... x n x n`; None where all drives are exact."""
+        if not self.own_drives.count and not self.own_drives.curved:
             return None
-        own = self._of_links(values)[..., self._links_size :]
-        n = len(self.joints)
-        spread = torch.zeros(len(self.drives), n, n, dtype=values.dtype)
-        for k, (i, j) in enumerate(self.drives):
-            spread[k, i - 1, j - 1] = 1
-        more = own @ spread.flatten(1)
-        return torch.eye(n, dtype=values.dtype) + more.reshape(*more.shape[:-1], n, n)
+        return self.own_drives.coupled(joints if self.own_drives.curved else None, self.of_drives(values))
+
+    def of_drives(self, values: Tensor) -> Tensor:
+        """Parameters of the drives, `... x d`, of all parameters `... x k` [SI]."""
+        return self._of_links(values)[..., self._links_size :]
 
     def driven(self, joints: Tensor, values: Tensor) -> Tensor:
         """Joints as the drives move them, `... x n`."""
-        coupled = self.coupled(values)
+        if self.own_drives.curved:
+            return self.own_drives.moved(joints, self.of_drives(values))
+        coupled = self.coupled(joints, values)
         return joints if coupled is None else (coupled @ joints[..., None])[..., 0]
 
     def link_transforms(self, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
@@ -361,7 +369,7 @@ class SerialArm(Mechanism):
         rates = linear @ base
         if self.orientation == "rotation_vector":
             rates = torch.cat([rates, angular @ base], dim=-1)
-        coupled = self.coupled(values)
+        coupled = self.coupled(joints, values)
         return rates.mT if coupled is None else rates.mT @ coupled
 
     def _rates(self, frames: list[Frames], values: Tensor) -> Screws:
@@ -379,7 +387,8 @@ class SerialArm(Mechanism):
         """Columns of the parameters between the frames, `... x k x 3`, from those of the links `... x l x 3` and of the
         joints as driven `... x n x 3`."""
         if self.drives:
-            more = [rates[..., i - 1, :] * joints[..., j - 1, None] for i, j in self.drives]
+            shape = self.own_drives.shapes(joints)[0]
+            more = [rates[..., i - 1, :] * shape[..., k, None] for k, (i, *_) in enumerate(self.drives)]
             columns = torch.cat([columns, torch.stack(more, -2).expand(*columns.shape[:-2], -1, 3)], -2)
         return self._shares @ columns if self._named else columns
 

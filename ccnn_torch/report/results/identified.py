@@ -143,6 +143,17 @@ class Beside(Result):
     after: float
 
 
+class Read(Result):
+    unit: Literal["m", "rad"]
+    rows: int
+    noise: float
+    """standard deviation: given, or that of the residuals; readings of one instrument in one unit share it"""
+    noise_known: bool
+    before: float
+    """RMS of what the reading is off by, links nominal"""
+    after: float
+
+
 class Constraint(Result):
     kind: Literal["sockets", "distances", "plane", "pose"]
     placements: list[Placement]
@@ -155,6 +166,8 @@ class Constraint(Result):
     noise_known: bool
     beside: list[Beside] = []
     """rows of other kinds in the same fit; none of them is held out"""
+    readings: dict[str, Read] = {}
+    """what instruments of several kinds read, by column"""
 
 
 class Transfer(Result):
