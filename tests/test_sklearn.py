@@ -23,8 +23,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.sklearn import BPLMRegressor, CCNNRegressor, ENNRegressor, GRNNRegressor
-from ccnn_torch.sklearn.base import SteppedRegressor
+from ccnn_torch.sklearn import BPLMRegressor, CCNNRegressor, ENNRegressor, GRNNRegressor, SteppedRegressor
 from ccnn_torch.training import Scaling, train
 
 ROOT = Path(__file__).parent.parent

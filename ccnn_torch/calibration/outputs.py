@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.calibration.calibrate import Calibration
-from ccnn_torch.calibration.learning.progress import genome
-from ccnn_torch.calibration.page.reach import reach_block
-from ccnn_torch.calibration.page.tables import write_tables
+from ccnn_torch.calibration.callbacks import genome
+from ccnn_torch.calibration.page import write_tables
 from ccnn_torch.calibration.result import by_score
+from ccnn_torch.calibration.statistics import reach_block
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
@@ -33,7 +33,7 @@ def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
         save_history(path, method, history)
     if calibration.config.save_report:
         # Loads matplotlib, which a run without pictures does not wait for.
-        from ccnn_torch.calibration.page.report import write_report
+        from ccnn_torch.calibration.figures import write_report
 
         write_report(path, results)
     else:

@@ -18,7 +18,7 @@ from ccnn_torch.config.tree import (
     Names,
     Section,
 )
-from ccnn_torch.identification.solvers.registry import SOLVERS, unknown_solver
+from ccnn_torch.identification.solvers import SOLVERS, unknown_solver
 from ccnn_torch.planning.config import ParameterConfig
 
 PER_LEG = "_per_leg"

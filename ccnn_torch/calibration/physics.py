@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.rows.dataset import Dataset
+from ccnn_torch.calibration.dataset import Dataset, pad_rows
 from ccnn_torch.compensation import machine_parts
 from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Known, Verdict, read_verdict
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
@@ -27,7 +27,7 @@ from ccnn_torch.effects import (
     without_pose_effects,
 )
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_unknown, judge_frames
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
@@ -235,3 +235,40 @@ def _rows(situation: Situation, rows: Tensor) -> Situation:
     covariates = {name: value[rows] for name, value in situation.covariates.items()}
     guess = None if situation.guess is None else situation.guess[rows]
     return replace(situation, joints=situation.joints[rows], covariates=covariates, guess=guess)
+
+
+def frames_of_repeats(
+    mechanism: Mechanism, records: Records, splits: list[Split], one_for: str = ""
+) -> tuple[Tensor | None, list[str]]:
+    """Fit frames that are unknown to the rows of each repeat that are not held out.
+
+    Args:
+        one_for: key of the config that needs one frame for all rows, if any.
+
+    Returns:
+        All parameters, nominal but for the frames, `r x 1 x k`, or `r x s x k` where frames are per group; None where
+        all frames are known; and notes.
+
+    Raises:
+        InputError: frames per group of rows where one is needed.
+    """
+    if one_for and mechanism.grouped:
+        raise InputError(
+            f"{one_for}: {mechanism.name} has frames per group of rows (frame_per, tool_per), and one compensator "
+            f"needs one frame; take the rows of one group, or write {one_for}=none"
+        )
+    rows = pad_rows([Dataset.part(split, "fit") for split in splits])
+    weights = torch.zeros(len(splits), len(records.joints), dtype=torch.float64)
+    weights.scatter_add_(1, rows.index, rows.weights)
+    parameters = fit_unknown(mechanism, records.joints, records.pose, weights, records.columns)
+    if parameters is None:
+        return None, []
+    if not mechanism.grouped:
+        parameters = parameters.unsqueeze(-2)
+    notes = []
+    if isinstance(mechanism, SerialArm):
+        about = (records.joints, records.pose, parameters, weights, records.path, records.name_rows)
+        notes += judge_frames(mechanism, *about)
+    unknown = " and ".join(getattr(mechanism, "unknown_frames", ()))
+    notes.append(f"Frames fitted first, on the training rows of each repeat: {unknown}.")
+    return parameters, notes

@@ -13,13 +13,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.calibration.choice import ModelChoice, choose_model
 from ccnn_torch.calibration.config import RunConfig, method_names
-from ccnn_torch.calibration.geometry.choice import ModelChoice, choose_model
-from ccnn_torch.calibration.geometry.effects_search import search_effects
-from ccnn_torch.calibration.geometry.frame_drift import without_frame_drift
-from ccnn_torch.calibration.geometry.frames import frames_of_repeats
-from ccnn_torch.calibration.geometry.physics import Physics, fit_physics, verdict_of
-from ccnn_torch.calibration.rows.dataset import Dataset, by_repeat, dataset_of
+from ccnn_torch.calibration.dataset import Dataset, by_repeat, dataset_of
+from ccnn_torch.calibration.effects_search import search_effects, without_frame_drift
+from ccnn_torch.calibration.physics import Physics, fit_physics, frames_of_repeats, verdict_of
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
