@@ -27,8 +27,7 @@ from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Column, Split
-from ccnn_torch.simulation.case_study import Simulation, build_case, simulate_realistic
-from ccnn_torch.simulation.realistic import build_machine
+from ccnn_torch.simulation.case_study import Simulation, build_case
 
 # Of the realistic machines.
 _MOST_JOINTS = 6
@@ -155,6 +154,8 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
 
 
 def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
+    from ccnn_validation.realistic.machine import build_machine, simulate_realistic
+
     about = config.realistic
     doubts = check_memory(config, about.rows, _MOST_JOINTS)
     machine = build_machine(about.machine, about.cause, about.strength, about.rows, about.noise, seeds)
