@@ -38,7 +38,7 @@ SMALL: dict[type[Any], dict[str, Any]] = {
 }
 # And for those that fit again and again.
 TINY: dict[type[Any], dict[str, Any]] = {
-    CCNNRegressor: {"generations": 2, "population": 6, "refinement_iterations": 6},
+    CCNNRegressor: {"generations": 2, "population": 6, "members": 1, "refinement_iterations": 3},
     ENNRegressor: {"generations": 4, "population": 8},
 }
 GRIDS: dict[type[Any], dict[str, Any]] = {
