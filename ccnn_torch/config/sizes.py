@@ -18,6 +18,7 @@ ANGLE_ARM = 0.3
 """Distance of the points that determine orientation [m]: the noise of an angle is that of a length over this."""
 
 Size = float | str
+"""A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
 
 
 def size(value: Size, unit: str | None, key: str) -> float:

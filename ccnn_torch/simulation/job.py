@@ -192,7 +192,7 @@ def simulate_records(
         InputError: an unknown effect, parameter or coordinate, an effect that these rows cannot show, values that no
             machine has, or effects so large that the machine does not reach its poses.
     """
-    config = config or SimulateConfig()
+    config = config or SimulateConfig.from_keys()
     if rows < 1:
         raise InputError(f"--rows: simulate at least 1 row, not {rows}")
     machine = load_mechanism(mechanism, **config.mechanism_keys) if isinstance(mechanism, str) else mechanism
