@@ -6,12 +6,13 @@ pyrenn's nodes are hyperbolic tangents, ours and SciPy's sigmoids.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import torch
 from scipy.optimize import least_squares
 
-from benchmarks.measure import Row, compare
+from benchmarks.measure import Call, Row, compare
 from benchmarks.peers import pyrenn_fit
 from benchmarks.training import training_rows
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, network_of, residual
@@ -45,14 +46,14 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
                 max_nfev=ITERATIONS,
             )
 
-        peers = {"SciPy least_squares (MINPACK)": (scipy_fit, 1 / STARTS)}
+        peers: dict[str, tuple[Call, float]] = {"SciPy least_squares (MINPACK)": (scipy_fit, 1 / STARTS)}
         if (fit := pyrenn_fit([3, HIDDEN, 3], x[0], y[0], FEW)) is not None:
             peers["pyrenn train_LM"] = (fit, SHARE)
         yield from compare(
             f"{ITERATIONS} iterations of Levenberg-Marquardt, {STARTS} networks 3-{HIDDEN}-3",
             rows,
             "rows",
-            lambda x=x, y=y, data=data: refine(masks, weights, x, y, data.weights, settings),
+            partial(refine, masks, weights, x, y, data.weights, settings),
             peers,
             rounds=1 if quick else 3,
         )

@@ -7,6 +7,7 @@ the other; ours has all side by side. Both get the same whitened columns, and mu
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -28,7 +29,7 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
             for rows in (100, 200, 400) if quick else (400, 2000, 10_000):
                 given = rows_of(machine, causes, rows)
                 task = f"diagnose a {machine}: {', '.join(causes)}"
-                yield from compare(task, rows, "rows", lambda g=given: diagnose_rows(*g), rounds=1 if quick else 3)
+                yield from compare(task, rows, "rows", partial(diagnose_rows, *given), rounds=1 if quick else 3)
     for machine in ("five_bar",) if quick else ("five_bar", "stewart"):
         yield from against_ridge(machine, 400)
 

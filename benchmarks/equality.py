@@ -125,7 +125,7 @@ def compare(name: str, compensator: Compensator, rows: int) -> None:
     with torch.inference_mode():
         parts = [
             compensator(q, x if n < given.shape[1] else None)[1:]
-            for q, x in zip(joints.split(2000), covariates.split(2000), strict=True)
+            for q, x in zip(torch.split(joints, 2000), torch.split(covariates, 2000), strict=True)
         ]
     wanted, inside = (torch.cat(v).numpy() for v in zip(*parts, strict=True))
     cells = []

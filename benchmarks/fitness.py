@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from benchmarks.generation import toy_rows
-from benchmarks.measure import Row, compare
+from benchmarks.measure import Call, Row, compare
 from benchmarks.peers import fitness_peers
 from ccnn_torch.evolution.coevolution import make_task, network_errors
 from ccnn_torch.evolution.genome import Genome
@@ -35,8 +36,8 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
         few = [Genome(layer.mask[:, :MOST], layer.weight[:, :MOST]) for layer in layers]
         many = [part for layer in few for part in (layer.mask[0].double(), layer.weight[0])]
         flat = torch.cat([layer.weight[0].flatten(1) for layer in few], 1)
-        vmapped = torch.func.vmap(lambda *parts: row_errors(parts, x, y).mean())
-        peers = {"torch.func.vmap": lambda many=many, vmapped=vmapped: vmapped(*many)}
+        vmapped: Call = torch.func.vmap(lambda *parts: row_errors(parts, x, y).mean())
+        peers: dict[str, Call] = {"torch.func.vmap": partial(vmapped, *many)}
         peers |= fitness_peers(SIZES, row_errors, torch.cat([x, y], 1), flat)
         ours = network_errors(layers, task)[0].numpy()
         np.testing.assert_allclose(ours[:LOOP], loop(), rtol=1e-9)
@@ -46,7 +47,7 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
             "fitness of networks 3-12-12-3, 125 rows",
             count,
             "networks",
-            lambda layers=layers: network_errors(layers, task),
+            partial(network_errors, layers, task),
             {name: (call, min(1.0, MOST / count)) for name, call in peers.items()}
             | {"numpy loop": (loop, LOOP / count)},
             rounds=3 if quick or count > 24_000 else 5,
@@ -79,10 +80,11 @@ def row_errors(parts: tuple[torch.Tensor, ...], x: torch.Tensor, y: torch.Tensor
 
 def one_by_one(network: list[tuple[np.ndarray, np.ndarray]], x: np.ndarray, y: np.ndarray) -> float:
     """The same in numpy."""
-    signal, fed = x, np.ones(x.shape[1], dtype=bool)
+    signal = x
+    fed: np.ndarray = np.ones(x.shape[1], dtype=bool)
     for layer, (mask, weight) in enumerate(network):
         signal = signal @ weight[:, :-1].T + weight[:, -1]
         if layer + 1 < len(network):
-            fed = (mask & fed).any(1)
+            fed = np.any(mask & fed, axis=1)
             signal = fed / (1 + np.exp(-signal))
     return float(np.sqrt(((signal - y) ** 2).sum(1)).mean())

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.measure import Row, compare
+from benchmarks.measure import Call, Row, compare
 from benchmarks.peers import generation_peers
 from ccnn_torch.evolution import CCNNSettings
 from ccnn_torch.evolution.coevolution import EPSILON, REPRESENTATIVES, advance, make_task, start
@@ -36,7 +36,7 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
     for population in (80,) if quick else (80, 800, 8000):
         settings = CCNNSettings(hidden=tuple(SIZES[1:-1]), population=population, generations=120)
         individuals = 3 * population
-        peers = {}
+        peers: dict[str, Call] = {}
         for networks in (individuals * (1 + REPRESENTATIVES), individuals) if population <= 800 else ():
             found = generation_peers(SIZES, row_errors, rows, networks)
             peers |= {f"{name}, {networks:,} whole networks": call for name, call in found.items()}
@@ -159,11 +159,12 @@ class NumpyLoop:
         self.fitness[layer] = scores
 
     def evaluate(self, network: list[Individual]) -> float:
-        signal, fed = self.inputs, np.ones(self.inputs.shape[1], dtype=bool)
+        signal = self.inputs
+        fed: np.ndarray = np.ones(self.inputs.shape[1], dtype=bool)
         for layer, (mask, weight) in enumerate(network):
             signal = signal @ weight[:, :-1].T + weight[:, -1]
             if layer + 1 < len(network):
-                fed = (mask & fed).any(1)
+                fed = np.any(mask & fed, axis=1)
                 signal = fed / (1 + np.exp(-signal))
         error = np.sqrt(((signal - self.targets) ** 2).sum(1)).mean()
         return 1 / (float(error) + EPSILON)

@@ -30,8 +30,8 @@ from scipy.optimize import dual_annealing
 
 from benchmarks.papers import main
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
+from ccnn_torch.identification.solvers import SOLVERS
 from ccnn_torch.identification.solvers.hga import FORBIDDEN, WIDTH, Objective
-from ccnn_torch.identification.solvers.registry import SOLVERS
 
 
 def solve_ga(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import warnings
 from collections.abc import Iterator
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -27,14 +28,14 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
     for rows in (30, 60, 120) if quick else (100, 300, 1000):
         data = training_rows(rows)
         x, y = data.inputs[0], data.targets[0]
-        peers: dict[str, Any] = {"scikit-learn": lambda x=x, y=y: scikit(x, y)}
+        peers: dict[str, Any] = {"scikit-learn": partial(scikit, x, y)}
         if find_spec("gpytorch"):
-            peers[f"GPyTorch, {STEPS} steps of Adam"] = lambda x=x, y=y: plain_gpytorch(x, y)
+            peers[f"GPyTorch, {STEPS} steps of Adam"] = partial(plain_gpytorch, x, y)
         yield from compare(
             "fit a Gaussian process, 3 outputs",
             rows,
             "rows",
-            lambda data=data: train(make_learner("gp"), data),
+            partial(train, make_learner("gp"), data),
             peers,
             rounds=1,
         )

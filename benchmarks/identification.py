@@ -11,6 +11,7 @@ All parameters are free, decorrelated by the pose noise. SciPy's `least_squares`
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +50,15 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
                 f"identify a {name}, {POSES} poses",
                 machines,
                 "machines",
-                lambda p=everyone: solve_lm(p),
-                {
-                    label: (lambda s=solvers, q=keys: [one.solve(**q) for one in s], sample / machines)
-                    for label, keys in KINDS.items()
-                },
+                partial(solve_lm, everyone),
+                {label: (partial(_solve_all, solvers, keys), sample / machines) for label, keys in KINDS.items()},
                 rounds=3,
                 note=f"off SciPy's minimum by {off:.0e} standard errors",
             )
+
+
+def _solve_all(solvers: list[Any], keys: dict[str, Any]) -> list[Any]:
+    return [one.solve(**keys) for one in solvers]
 
 
 def problems(name: str, machines: int, poses: int, sample: int) -> tuple[Problem, list[Problem]]:

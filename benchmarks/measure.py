@@ -11,6 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -60,6 +61,11 @@ def seconds_of(call: Call) -> float:
     after = os.times()
     own = time.process_time() - before
     return own + after.children_user - children.children_user + after.children_system - children.children_system
+
+
+def _repeat(call: Call, often: int) -> None:
+    for _ in range(often):
+        call()
 
 
 def operations(call: Call) -> int:
@@ -114,7 +120,8 @@ def compare(
         rounds -= 1
     for _ in range(rounds):
         for name, (call, share) in calls.items():
-            times[name].append(seconds_of(lambda c=call, n=often[name]: [c() for _ in range(n)]) / often[name] / share)
+            taken = seconds_of(partial(_repeat, call, often[name]))
+            times[name].append(taken / often[name] / share)
     limit = None
     if flops:
         limit = statistics.median(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -46,13 +47,13 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
         for samples in (2000,) if quick else (10_000, 100_000, 1_000_000):
             path = Path(folder) / f"{samples}.csv"
             write_log(path, samples)
-            found = diagnose_motion(load_logs([path]), nominal).content
+            found = _diagnose(path, nominal).content
             peers = fits(load_logs([path]), nominal) if samples <= 10_000 else {}
             rows = compare(
                 "diagnose a servo in motion",
                 samples,
                 "samples",
-                lambda p=path: diagnose_motion(load_logs([p]), nominal),
+                partial(_diagnose, path, nominal),
                 peers,
                 rounds=1,
                 note=f"named: {', '.join(found['verdict']['effects']) or 'none'}",
@@ -62,6 +63,10 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
                     delay, friction = peers[row.peer]()
                     row = replace(row, note=f"{row.note}; the peer's {1e3 * delay:.2f} ms, {1e3 * friction:.1f} mN m")
                 yield row
+
+
+def _diagnose(path: Path, nominal: Any) -> Any:
+    return diagnose_motion(load_logs([path]), nominal)
 
 
 def fits(logs: Any, nominal: Any) -> dict[str, Fit]:

@@ -22,8 +22,9 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, TensorDataset
 
+from benchmarks.measure import Call
+
 PEERS = {"evotorch": "EvoTorch", "evox": "EvoX", "pyrenn": "pyrenn"}
-Call = Callable[[], Any]
 Score = Callable[..., Tensor]
 # A genetic algorithm's settings, of both.
 _TOURNAMENT, _STEP = 3, 0.1
@@ -73,7 +74,8 @@ def fitness_peers(sizes: Sequence[int], error: Score, rows: Tensor, flat: Tensor
 
         def evotorch() -> Tensor:
             problem.evaluate(batch)
-            return batch.evals[:, 0]
+            values: Tensor = batch.evals[:, 0]
+            return values
 
         found["EvoTorch"] = evotorch
     if find_spec("evox"):

@@ -10,6 +10,7 @@ equation a pose) and both legs (12 parameters, 2 equations).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,7 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
             f"gain of every candidate pose, {name} of a five-bar",
             count,
             "candidates",
-            lambda design=design, old=old: all_gains(design, old),
-            {"numpy loop": (lambda r=shifted, c=chosen: plain_gains(r, c, c[0]), len(shifted) / count)},
+            partial(all_gains, design, old),
+            {"numpy loop": (partial(plain_gains, shifted, chosen, chosen[0]), len(shifted) / count)},
             rounds=3,
         )

@@ -6,6 +6,7 @@ import datetime
 import json
 import os
 import platform
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def _by_task(rows: list[Row]) -> dict[tuple[str, str], dict[int, float]]:
     return points
 
 
-def markdown(about: dict[str, object], found: dict[str, list[Row]], curves: list[dict[str, object]]) -> str:
+def markdown(about: Mapping[str, object], found: dict[str, list[Row]], curves: list[dict[str, object]]) -> str:
     """Machine, one table, and what the curves say far out."""
     absent = missing()
     lines = [
@@ -93,8 +94,8 @@ def markdown(about: dict[str, object], found: dict[str, list[Row]], curves: list
     if curves:
         lines += ["", "| task | grows with the power | extrapolated to | time |", "| --- | ---: | ---: | ---: |"]
         for c in curves:
-            cells = (c["task"], f"{c['exponent']:.2f}", f"{c['size']:,} {c['of']}", _time(float(str(c["seconds"]))))
-            lines.append("| " + " | ".join(map(str, cells)) + " |")
+            shown = (c["task"], f"{c['exponent']:.2f}", f"{c['size']:,} {c['of']}", _time(float(str(c["seconds"]))))
+            lines.append("| " + " | ".join(map(str, shown)) + " |")
     return "\n".join(lines) + "\n"
 
 

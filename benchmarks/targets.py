@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -151,7 +152,8 @@ int ccnn_compensate(const double joints[], const double covariates[], double com
 
 def by_hand(compensator: Compensator) -> str:
     """The program with the model's numbers."""
-    domain, scaling, layers = compensator.domain, compensator.scaling, compensator.network.layers
+    domain, scaling = compensator.domain, compensator.scaling
+    layers: Any = compensator.network.layers
     tables = {f"w{k}": layer.weight for k, layer in enumerate(layers)}
     tables |= {f"b{k}": layer.bias for k, layer in enumerate(layers)}
     tables |= {"centre": scaling.centre, "half": scaling.half_range, "mean": scaling.mean, "scale": scaling.deviation}

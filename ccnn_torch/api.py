@@ -7,7 +7,7 @@ from typing import Any
 
 from ccnn_torch.calibration.calibrate import Calibration, calibrate as _calibrate
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.rows.prepare import prepare
+from ccnn_torch.calibration.prepare import prepare
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.config.split import given_records, name_given
 from ccnn_torch.diagnosis.config import DiagnoseConfig

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.calibration.page.paper_tables import PAPER
+from ccnn_torch.calibration.page import paper_case
 from ccnn_torch.display import number_text
 from ccnn_torch.report.results.base import Spread, interval_text
 
@@ -137,7 +137,7 @@ def case_rows(rows: Rows, runs: Sequence[Results]) -> Rows:
     """Mean squared error on held-out rows of a case study [1e-10 m²], beside the paper's for all joints."""
     (results,) = runs
     joints = [*(joint["name"] for joint in results["joints"]), "all"]
-    paper, reach = PAPER[results["case"]].methods, (results["reach"] or {"methods": {}})["methods"]
+    paper, reach = (paper_case(results["case"]) or {})["methods"], (results["reach"] or {"methods": {}})["methods"]
     lines = []
     for name, block in results["methods"].items():
         effort = reach.get(name)
@@ -151,7 +151,7 @@ def case_rows(rows: Rows, runs: Sequence[Results]) -> Rows:
                 ("–" if results["reach"] is None else "never")
                 if effort is None
                 else f"{effort['seconds']:.2g} / {effort['evaluations']:.0f}",
-                number_text(paper[name][0][-1] / 1e-10, 3) if name in paper else "–",
+                number_text(paper[name]["mse"][-1] / 1e-10, 3) if name in paper else "–",
             ]
         )
     floor = results["floor"]["realised"]

@@ -8,10 +8,10 @@ import onnx
 import torch
 from torch import Tensor
 
+from ccnn_torch.compensation.targets.lowering import recorded
 from ccnn_torch.compensation.targets.onnx_export import rows_apart_from
 from ccnn_torch.compensation.targets.onnx_graph import Graph
 from ccnn_torch.compensation.targets.onnx_operations import ByTensors
-from ccnn_torch.compensation.targets.recording import recorded
 
 
 def to_onnx(module: torch.nn.Module, inputs: Mapping[str, Tensor], outputs: Sequence[str]) -> onnx.ModelProto:

@@ -17,10 +17,10 @@ from test_uncertainty import linear_dataset
 from toy import Descent
 
 from ccnn_torch.calibration.calibrate import calibrate
-from ccnn_torch.calibration.learning.early_stop import Plan
-from ccnn_torch.calibration.learning.method_choice import Comparison, compare
-from ccnn_torch.calibration.page.tables import run_page
-from ccnn_torch.calibration.rows.dataset import Dataset
+from ccnn_torch.calibration.dataset import Dataset
+from ccnn_torch.calibration.early_stop import Plan
+from ccnn_torch.calibration.method_choice import Comparison, compare
+from ccnn_torch.calibration.page import run_page
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner
 from ccnn_torch.learners.constant import Constant
@@ -165,7 +165,7 @@ def test_a_run_killed_on_its_way_resumes_to_the_same_result(
         if moment == "between":
             patched.setattr(CALIBRATE, "refit", kill)
         else:
-            patched.setattr("ccnn_torch.calibration.learning.early_stop.sd_scale", kill)
+            patched.setattr("ccnn_torch.calibration.early_stop.sd_scale", kill)
         with pytest.raises(Killed):
             calibrate(chosen, RunFolder(tmp_path / "killed"))
     killed = RunFolder(tmp_path / "killed")

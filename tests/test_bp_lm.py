@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.rows.prepare import prepare
+from ccnn_torch.calibration.prepare import prepare
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, network_of
 from ccnn_torch.evolution.network import forward

@@ -13,11 +13,10 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_run import short
 
+from ccnn_torch.calibration.figures import progress_plot
 from ccnn_torch.calibration.job import RUN
-from ccnn_torch.calibration.page.figures import progress_plot
-from ccnn_torch.calibration.page.long_table import long_table
-from ccnn_torch.calibration.page.reach import reach_block
-from ccnn_torch.calibration.page.tables import result_tables, run_page
+from ccnn_torch.calibration.page import long_table, result_tables, run_page
+from ccnn_torch.calibration.statistics import reach_block
 from ccnn_torch.report.arrays import load_history
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.report.results.run import RunResults

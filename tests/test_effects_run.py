@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.rows.prepare import prepare
+from ccnn_torch.calibration.prepare import prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
 from ccnn_torch.compensation.model_files.metadata import open_onnx

@@ -13,7 +13,7 @@ from test_run import short
 
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.job import RUN
-from ccnn_torch.calibration.page.tables import failures, run_page
+from ccnn_torch.calibration.page import failures, run_page
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.report.results.run import ModelFiles, RunResults

@@ -18,11 +18,10 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback
+from ccnn_torch.calibration.callbacks import EventFile, TensorBoardCallback
 from ccnn_torch.errors import InputError, WriteError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.records import write_table
-from ccnn_torch.report.event_file import EventFile
 from ccnn_torch.run_folder.folder import RunFolder, locked
 
 ROOT = Path(__file__).parent.parent
@@ -78,7 +77,7 @@ def test_nothing_in_the_package_writes_files_in_another_way() -> None:
     package = ROOT / "ccnn_torch"
     found = {str(p.relative_to(package)) for p in package.rglob("*.py") if ways.search(p.read_text(encoding="utf-8"))}
     # A private key is made with its own rights, and never in the place of another.
-    assert found == {"files/write.py", "report/event_file.py", "compensation/model_files/signature.py"}
+    assert found == {"files/write.py", "calibration/callbacks.py", "compensation/model_files/signature.py"}
 
 
 def test_a_full_disk_keeps_the_old_commands(cli: Cli, tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from hypothesis import given, settings, strategies as st
 from test_uncertainty import linear_dataset
 from toy import Descent
 
-from ccnn_torch.calibration.learning.early_stop import Plan, choose, fold_dataset
-from ccnn_torch.calibration.learning.fitting import fit_method
+from ccnn_torch.calibration.early_stop import Plan, choose, fold_dataset
+from ccnn_torch.calibration.fitting import fit_method
 from ccnn_torch.errors import InputError
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import TrainingData

@@ -11,9 +11,9 @@ from fitted import fitted_geometry
 from mechanisms.catalogue import make
 
 from ccnn_torch import calibrate
+from ccnn_torch.calibration.choice import Candidate, simplest_of_best
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.geometry.choice import Candidate, simplest_of_best
-from ccnn_torch.calibration.rows.prepare import Prepared, prepare
+from ccnn_torch.calibration.prepare import Prepared, prepare
 from ccnn_torch.mechanisms import fit_frames, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation
 from ccnn_torch.records import write_table

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import RUN
-from ccnn_torch.calibration.rows.prepare import prepare
+from ccnn_torch.calibration.prepare import prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError

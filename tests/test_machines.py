@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ccnn_validation.realistic.machine import _GRID, CAUSES, MACHINES, RealisticMachine, _follow, build_machine
+from ccnn_validation.realistic.structure import GRAVITY, ArmStructure, LegStructure
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.rows.prepare import Prepared, prepare
+from ccnn_torch.calibration.prepare import Prepared, prepare
 from ccnn_torch.errors import InputError
-from ccnn_torch.simulation.realistic import _GRID, CAUSES, MACHINES, RealisticMachine, _follow, build_machine
-from ccnn_torch.simulation.structure import GRAVITY, ArmStructure, LegStructure
 
 ROWS = 24
 

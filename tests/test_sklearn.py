@@ -23,8 +23,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.sklearn import BPLMRegressor, CCNNRegressor, ENNRegressor, GRNNRegressor
-from ccnn_torch.sklearn.base import SteppedRegressor
+from ccnn_torch.sklearn import BPLMRegressor, CCNNRegressor, ENNRegressor, GRNNRegressor, SteppedRegressor
 from ccnn_torch.training import Scaling, train
 
 ROOT = Path(__file__).parent.parent
@@ -39,7 +38,7 @@ SMALL: dict[type[Any], dict[str, Any]] = {
 }
 # And for those that fit again and again.
 TINY: dict[type[Any], dict[str, Any]] = {
-    CCNNRegressor: {"generations": 2, "population": 6, "refinement_iterations": 6},
+    CCNNRegressor: {"generations": 2, "population": 6, "members": 1, "refinement_iterations": 3},
     ENNRegressor: {"generations": 4, "population": 8},
 }
 GRIDS: dict[type[Any], dict[str, Any]] = {

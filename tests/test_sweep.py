@@ -14,9 +14,9 @@ import pytest
 from frozen import frozen
 
 from ccnn_torch import api
+from ccnn_torch.calibration import prepare
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import RUN
-from ccnn_torch.calibration.rows import prepare
 from ccnn_torch.compensation import load_model
 from ccnn_torch.errors import InputError
 from ccnn_torch.study.sweep import load_sweep

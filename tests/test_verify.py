@@ -15,12 +15,14 @@ from frozen import frozen
 
 import ccnn_torch
 from ccnn_torch import calibrate
-from ccnn_torch.compensation import new_key_pair, sign_model
+from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.compensation import load_compensation, new_key_pair, sign_model
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import PoseError, load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import write_table
 from ccnn_torch.report.json_files import plain
+from ccnn_torch.verification.job import pseudoerror_settings
 from ccnn_torch.verification.promise import configurations, paired_gain, promise_block, promised, repeated
 
 # Its figures are looked at.
@@ -202,6 +204,9 @@ def test_an_identified_machine(tmp_path: Path) -> None:
     (tmp_path / "identified.json").unlink()
     told = ccnn_torch.verify(tmp_path / "identified.yaml", new)
     assert told["kept"] and told["position"]["promised"] is None and "promises no figure" in told["text"]
+    # Nor a card: joint deviations are found as a run finds them.
+    settings = pseudoerror_settings(load_compensation(tmp_path / "identified.yaml"), load_mechanism(DELTA))
+    assert settings["rotation_weight"] == RunConfig.model_fields["rotation_weight"].default
 
 
 def test_the_limit_is_passed_once_in_twenty() -> None:

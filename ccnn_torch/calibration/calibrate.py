@@ -13,10 +13,10 @@ from torch import Tensor
 
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
-from ccnn_torch.calibration.learning.fitting import Fitted, fit_method, on_other_rows, refit
-from ccnn_torch.calibration.learning.method_choice import Comparison, compare
+from ccnn_torch.calibration.fitting import Fitted, fit_method, on_other_rows, refit
+from ccnn_torch.calibration.method_choice import Comparison, compare
+from ccnn_torch.calibration.prepare import Prepared, damping_of, over_all_rows, prepare
 from ccnn_torch.calibration.result import best_method, chosen_by, plan_of, run_results
-from ccnn_torch.calibration.rows.prepare import Prepared, damping_of, over_all_rows, prepare
 from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner, make_learner

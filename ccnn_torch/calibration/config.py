@@ -15,6 +15,7 @@ from ccnn_torch.config.tree import (
     Files,
     JobConfig,
     JointMap,
+    MechanismKeys,
     Names,
     Section,
 )
@@ -191,7 +192,7 @@ class RunConfig(JobConfig):
         default=None,
         description="mechanism of the records: tripod, machine_tool, a DH file (.yaml), a URDF, or file.py:Name",
     )
-    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    mechanism_keys: MechanismKeys
     geometry: Literal["auto", "identify", "none"] = Field(
         default="auto",
         description="identify = find all geometric parameters on the training rows of records, and let the network "
@@ -242,17 +243,12 @@ class RunConfig(JobConfig):
 
     @model_validator(mode="before")
     @classmethod
-    def _fill(cls, tree: Any) -> Any:
-        """An empty section is one of defaults; a case has its order and the machine tool its variant."""
-        if not isinstance(tree, dict):
+    def _of_the_case(cls, tree: Any) -> Any:
+        """A case has its order and the machine tool its variant."""
+        if not isinstance(tree, dict) or tree.get("case") not in ("tripod", "machine_tool"):
             return tree
-        sections = [key for key, field in cls.model_fields.items() if field.default_factory is not None]
-        tree = {key: value for key, value in tree.items() if value is not None or key not in sections}
-        if tree.get("case") in ("tripod", "machine_tool") and tree.get("order") is None:
-            tree["order"] = "raster"
-        if tree.get("case") == "machine_tool" and tree.get("variant") is None:
-            tree["variant"] = "printed"
-        return tree
+        usual = {"order": "raster"} | ({"variant": "printed"} if tree["case"] == "machine_tool" else {})
+        return tree | {key: value for key, value in usual.items() if tree.get(key) is None}
 
     @field_validator("methods")
     @classmethod

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.learning.fitting import Fitted
-from ccnn_torch.calibration.rows.prepare import Prepared
+from ccnn_torch.calibration.fitting import Fitted
+from ccnn_torch.calibration.prepare import Prepared
 from ccnn_torch.compensation import Compensator
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Instrument, PoseError, Seen

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.calibration.dataset import Dataset, Rows, pad_rows
+from ccnn_torch.calibration.early_stop import Plan
 from ccnn_torch.calibration.evaluate import Outcome, pose_with_effects, pose_with_geometry
-from ccnn_torch.calibration.geometry.physics import Physics
-from ccnn_torch.calibration.learning.early_stop import Plan
-from ccnn_torch.calibration.learning.method_choice import Comparison
-from ccnn_torch.calibration.learning.uncertainty import coverage, inside_domain
-from ccnn_torch.calibration.rows.dataset import Dataset, Rows, pad_rows
-from ccnn_torch.calibration.rows.prepare import Prepared
+from ccnn_torch.calibration.method_choice import Comparison
+from ccnn_torch.calibration.physics import Physics
+from ccnn_torch.calibration.prepare import Prepared
 from ccnn_torch.calibration.statistics import (
     before_block,
     constant_errors,
@@ -26,6 +25,7 @@ from ccnn_torch.calibration.statistics import (
     ratio_to_floor,
     spread,
 )
+from ccnn_torch.calibration.uncertainty import coverage, inside_domain
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.report.results.base import Axis, Spread

@@ -296,7 +296,7 @@ def picture(
 
     ccnn picture runs/tripod docs/picture.png --joint q3
     """
-    from ccnn_torch.calibration.page.report import make_picture
+    from ccnn_torch.calibration.figures import make_picture
     from ccnn_torch.report.screen import say
 
     caption = make_picture(run_dir, out, joint)

@@ -167,30 +167,22 @@ def fit_compensator(
             f"training inputs {tuple(inputs.shape)} and deviations {tuple(deviations.shape)} do not fit "
             f"{n} joints and {len(covariates)} covariates"
         )
-    inputs, deviations = inputs.detach(), deviations.detach()
-    total = fading = deviations
-    with torch.no_grad():
-        if effects is not None:
-            effects = copy.deepcopy(effects)
-            total = fading = deviations + effects(inputs[:, :n] + deviations, inputs[:, n:])
-        if geometry is not None:
-            geometry = copy.deepcopy(geometry)
-            total = fading = fading + geometry(inputs[:, :n] + fading)
-    limit = default_limit(total) if limit is None else limit.detach()
+    # Copies: what is compensated with does not change when the learner trains on.
+    frozen, geometry, effects, machine = copy.deepcopy((network, geometry, effects, machine))
+    frozen.requires_grad_(False)
+    inputs, whole = inputs.detach(), _with_known(inputs, deviations, geometry, effects)
+    limit = default_limit(whole) if limit is None else limit.detach()
     if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
         raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
     sd_scale = torch.ones_like(limit) if sd_scale is None else sd_scale.detach().clone()
     if sd_scale.shape != (n,) or not bool((sd_scale > 0).all() & torch.isfinite(sd_scale).all()):
         raise InputError(f"sd_scale must be one finite number above 0 for each of the {n} joints")
-    safe = torch.minimum(torch.maximum(fading.mean(0), -limit), limit)
-    safe_sd = (fading - safe).square().mean(0).sqrt()
+    safe = torch.minimum(torch.maximum(whole.mean(0), -limit), limit)
+    safe_sd = (whole - safe).square().mean(0).sqrt()
     reach = torch.cat([limit, limit.new_zeros(len(covariates))])
     domain = Domain.fit(inputs, reach, margin, transition)
-    # A copy: what is compensated with does not change when the learner trains on.
-    frozen = copy.deepcopy(network).requires_grad_(False)
     alone = geometry is None and effects is None and machine is None
     size = {} if alone else {"count": 512, "at_once": 1024}
-    machine = copy.deepcopy(machine)
     share = 1.0
     for _ in range(_DAMPINGS):
         scaled = copy.deepcopy(scaling)
@@ -219,6 +211,19 @@ def fit_compensator(
         f"{STEEPEST_DEVIATION:g} the command cannot be solved for safely; train with more rows, fewer nodes or "
         "regularisation, and leave out rows near singular poses (max_condition)"
     )
+
+
+@torch.no_grad()
+def _with_known(
+    inputs: Tensor, deviations: Tensor, geometry: ChebyshevExpansion | None, effects: PhysicalEffects | None
+) -> Tensor:
+    """Training deviations that the effects and the geometry left, and theirs; `s x n` [SI]."""
+    n = deviations.shape[-1]
+    if effects is not None:
+        deviations = deviations + effects(inputs[:, :n] + deviations, inputs[:, n:])
+    if geometry is not None:
+        deviations = deviations + geometry(inputs[:, :n] + deviations)
+    return deviations.detach()
 
 
 @torch.no_grad()

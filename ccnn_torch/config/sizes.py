@@ -18,6 +18,7 @@ ANGLE_ARM = 0.3
 """Distance of the points that determine orientation [m]: the noise of an angle is that of a length over this."""
 
 Size = float | str
+"""A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
 
 
 def size(value: Size, unit: str | None, key: str) -> float:
@@ -143,3 +144,23 @@ def _plain(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def prior_sizes(given: Mapping[str, Size], geometry: Sequence[Parameter], key: str) -> dict[str, float]:
+    """Standard deviation of each prior [SI] by its name or pattern; a text has the unit of what it fits.
+
+    Raises:
+        InputError: a pattern that fits nothing, an entry that is no size, or a unit of another kind than that of a
+            parameter that it fits.
+    """
+    # Imported here: other sizes need nothing of the identification.
+    from ccnn_torch.identification.problems.parameters import match_parameters
+
+    units = {p.name: p.unit for p in geometry}
+    found = {}
+    for pattern, value in given.items():
+        fits = match_parameters(geometry, [pattern], key.partition(".")[2])
+        kinds = list(dict.fromkeys(units[p.name] for p in geometry if p.name in fits))
+        # Converted for every unit that the pattern matches, so that no mismatch is missed.
+        found[pattern] = max(size(value, unit, f"{key}.{pattern}") for unit in kinds)
+    return found

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from ccnn_torch.config.keys import config_model, explain
 from ccnn_torch.errors import InputError
@@ -180,6 +180,8 @@ JointMap = Annotated[
 ]
 """Joints -> linear functions of columns."""
 
+MechanismKeys = Annotated[dict[str, Any], Field(default={}, description="keys of the mechanism's constructor")]
+
 
 class Section(BaseModel):
     """A section of a config: unknown keys are refused, values are finite and immutable."""
@@ -192,6 +194,15 @@ class JobConfig(Section):
 
     of_a_run: ClassVar[tuple[str, ...]] = ()
     """Keys that mean the same in a config for `ccnn run`, where a command takes one and leaves its other keys out."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _empty_sections(cls, tree: Any) -> Any:
+        """An empty section is one of defaults."""
+        if not isinstance(tree, dict):
+            return tree
+        sections = [key for key, field in cls.model_fields.items() if field.default_factory is not None]
+        return {key: value for key, value in tree.items() if value is not None or key not in sections}
 
     @classmethod
     def from_file(cls, path: str | Path | None, overrides: Iterable[str] = (), note: Note | None = None) -> Self:

@@ -8,7 +8,7 @@ import io
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -129,3 +129,12 @@ def _as_write_error(path: Path) -> Iterator[None]:
         yield
     except OSError as reason:
         raise WriteError(f"{path}: cannot be written ({reason.strerror}); the old content is unchanged") from None
+
+
+def write_rows(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> None:
+    """Write a CSV file; numbers have 17 significant digits, None is an empty cell.
+
+    Raises:
+        WriteError: it cannot be written.
+    """
+    write_whole(path, csv_text([header, *rows]))

@@ -29,8 +29,8 @@ from ccnn_torch.identification.problems.problem import (
     Solver as Solver,
     split_by_leg as split_by_leg,
 )
+from ccnn_torch.identification.solvers import SOLVERS as SOLVERS, get_solver as get_solver
 from ccnn_torch.identification.solvers.lm import LOSSES as LOSSES, reweighted as reweighted, solve_lm as solve_lm
-from ccnn_torch.identification.solvers.registry import SOLVERS as SOLVERS, get_solver as get_solver
 from ccnn_torch.identification.solvers.tikhonov import (
     LCurve as LCurve,
     l_curve as l_curve,

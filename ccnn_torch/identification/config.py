@@ -9,23 +9,22 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from ccnn_torch.config.sizes import Size
 from ccnn_torch.config.split import HeldOutConfig
 from ccnn_torch.config.tree import (
     Columns,
     Files,
     JobConfig,
     JointMap,
+    MechanismKeys,
     Names,
     Section,
 )
-from ccnn_torch.identification.solvers.registry import SOLVERS, unknown_solver
+from ccnn_torch.identification.solvers import SOLVERS, unknown_solver
 from ccnn_torch.planning.config import ParameterConfig
 
 PER_LEG = "_per_leg"
 """A method with this ending identifies each leg from its own equations alone."""
-
-Size = float | str
-"""A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
 
 
 class FrameConfig(Section):
@@ -151,7 +150,7 @@ class IdentifyConfig(JobConfig):
         default="",
         description="a mechanism's name, a DH file (.yaml), a URDF, an identified.yaml, or file.py:Name",
     )
-    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    mechanism_keys: MechanismKeys
     links: Literal["given", "six"] = Field(
         default="given",
         description="parameters of a serial arm's links: those of its file (given), or a place and a turn of each "
@@ -216,15 +215,6 @@ class IdentifyConfig(JobConfig):
     def fits_again(self) -> bool:
         """Whether what was judged is fitted again to all rows."""
         return self.refit and self.records is not None and self.split.test_file is None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _fill(cls, tree: Any) -> Any:
-        """An empty section is one of defaults; `all` is spelt out."""
-        if not isinstance(tree, dict):
-            return tree
-        sections = [key for key, field in cls.model_fields.items() if field.default_factory is not None]
-        return {key: value for key, value in tree.items() if value is not None or key not in sections}
 
     @field_validator("methods")
     @classmethod

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.identification.page import holder
-from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, SERIES, Plot, bare, styled
+from ccnn_torch.report.figures import AFTER, BEFORE, FLOOR, SERIES, Plot, bare, styled
 
 Array = NDArray[np.float64]
 Arrays = Mapping[str, Array]

@@ -8,10 +8,10 @@ from statistics import median
 from typing import Any
 
 from ccnn_torch.display import count_text, display_unit, number_text, own_unit
+from ccnn_torch.files.write import write_rows
 from ccnn_torch.identification.judge import figure_text
 from ccnn_torch.identification.klipper import printer_table
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
-from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.page import InlineFigure, Page, sections_of
 from ccnn_torch.report.table import Table, table_of
@@ -394,7 +394,7 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
     """
     # Loads matplotlib, which only a report waits for.
     from ccnn_torch.identification.figures import identified_plots
-    from ccnn_torch.report.figures.style import inline_figures
+    from ccnn_torch.report.figures import inline_figures
 
     folder = Path(folder)
     results = read_json(folder / "identified.json") if results is None else results

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.prior_sizes import prior_sizes
+from ccnn_torch.config.sizes import prior_sizes
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import (
     Fit,
@@ -29,7 +29,7 @@ from ccnn_torch.identification.measured import Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.poses import compares_poses
 from ccnn_torch.identification.problems.problem import part_of
-from ccnn_torch.identification.solvers.registry import get_solver
+from ccnn_torch.identification.solvers import get_solver
 from ccnn_torch.mechanisms import Framed, Mechanism
 from ccnn_torch.training import load_checkpoint, save_checkpoint
 

@@ -12,13 +12,13 @@ from ccnn_torch.diagnosis.page.data import NEXT
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
 from ccnn_torch.diagnosis.verdict.text import in_doubt
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import write_rows
 from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
 from ccnn_torch.motion.identified import IDENTIFIED, write_identified
 from ccnn_torch.motion.known import shares_of
 from ccnn_torch.motion.log import load_logs
 from ccnn_torch.motion.setting import nominal_of
 from ccnn_torch.motion.stretches import phases_of
-from ccnn_torch.report.csv_file import write_rows
 
 _STEPS = {
     "reading the records": 1.0,

@@ -1,7 +1,7 @@
 """Which poses to measure: observability, active calibration, and what each further pose gives."""
 
 from ccnn_torch.planning.candidates import Candidates as Candidates, draw_candidates as draw_candidates
-from ccnn_torch.planning.gains import (
+from ccnn_torch.planning.design import (
     Gains as Gains,
     Observability as Observability,
     observability as observability,

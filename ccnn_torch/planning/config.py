@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field
 
-from ccnn_torch.config.tree import Columns, JobConfig, JointMap, Names, Section
-
-Size = float | str
-"""A number in SI, or a text of number and unit, such as `0.1 mm` or `0.03 deg`."""
+from ccnn_torch.config.sizes import Size
+from ccnn_torch.config.tree import Columns, JobConfig, JointMap, MechanismKeys, Names, Section
 
 
 class ParameterConfig(Section):
@@ -31,7 +29,7 @@ class PlanConfig(JobConfig):
     of_a_run = ("columns", "joint_map", "mechanism", "mechanism_keys", "seed")
 
     mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")
-    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    mechanism_keys: MechanismKeys
     columns: Columns
     joint_map: JointMap
     parameters: ParameterConfig = Field(default_factory=ParameterConfig)

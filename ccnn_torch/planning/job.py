@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.config.prior_sizes import prior_sizes
-from ccnn_torch.config.sizes import size, sizes_of_joints, sizes_of_pose
+from ccnn_torch.config.sizes import prior_sizes, size, sizes_of_joints, sizes_of_pose
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import make_folder, write_whole
 from ccnn_torch.identification import ParameterChoice
@@ -24,7 +23,7 @@ from ccnn_torch.planning.program import program_text
 from ccnn_torch.records import write_table
 from ccnn_torch.records.commanded import SECOND
 from ccnn_torch.records.joint_map import JointMap, read_joint_map
-from ccnn_torch.report.figures.style import inline_svg, save_figure
+from ccnn_torch.report.figures import inline_svg, save_figure
 from ccnn_torch.report.page import InlineFigure, Section
 from ccnn_torch.units import from_si, split_header
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.planning import Plan
-from ccnn_torch.report.figures.style import FLOOR, GREY, SERIES, Plot, styled
+from ccnn_torch.report.figures import FLOOR, GREY, SERIES, Plot, styled
 from ccnn_torch.report.page import Page, Section, sections_of
 from ccnn_torch.report.table import Table
 

@@ -22,13 +22,16 @@ from ccnn_torch.planning.candidates import (
     what_is_seen,
 )
 from ccnn_torch.planning.design import (
+    Gains,
     add_best,
     exchange,
+    gains_of,
+    gains_of_sets,
     make_design,
     order_by_worth,
+    recommended_count,
     tightest_bound,
 )
-from ccnn_torch.planning.gains import Gains, gains_of, gains_of_sets, recommended_count
 
 # Draws of random poses that a plan is compared with; odd, for the median.
 _RANDOM = 101

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, PoseError, load_mechanism
-from ccnn_torch.simulation.realistic import RealisticMachine
 
 CASES = ("tripod", "machine_tool")
 VARIANTS = ("printed", "tabulated")
@@ -169,20 +168,3 @@ def _raster(*axes: NDArray[np.float64]) -> NDArray[np.float64]:
 def _one_of(key: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
         raise InputError(f"{key}={value!r} is unknown; write one of {', '.join(known)}")
-
-
-def simulate_realistic(
-    machine: RealisticMachine, deviations: Callable[[Tensor], Tensor], measured: Tensor
-) -> Simulation:
-    """A machine as built, which repeats exactly: propagate the noise of the measurement to the joints.
-
-    Args:
-        machine: the rows.
-        deviations: joint deviations of poses, `r x s x p` -> `r x s x n` [SI].
-        measured: those of the measured poses, `r x s x n` [SI].
-    """
-    true = deviations(machine.reached)
-    # One degree of freedom of the pose at a time: the noise is far below the curvature of the kinematics.
-    parts = [(deviations(machine.shifted(i)) - true).square() for i in range(len(machine.sd))]
-    variance = torch.stack(parts).sum(0)
-    return Simulation(machine.pose, measured - true, variance, lambda command: (machine.pose_error(command),) * 2)

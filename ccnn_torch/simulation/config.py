@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ccnn_torch.config.tree import JobConfig
+from ccnn_torch.config.tree import JobConfig, MechanismKeys
 from ccnn_torch.effects.covariates import SHIFT
 
 Positive = Annotated[float, Field(gt=0)]
@@ -15,7 +15,7 @@ Positive = Annotated[float, Field(gt=0)]
 class SimulateConfig(JobConfig):
     """What `ccnn simulate` accepts."""
 
-    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    mechanism_keys: MechanismKeys
     covariates: list[str] | None = Field(
         default=None, description="columns to write, names or patterns; null = all that the rows have"
     )

@@ -192,25 +192,19 @@ def simulate_records(
         InputError: an unknown effect, parameter or coordinate, an effect that these rows cannot show, values that no
             machine has, or effects so large that the machine does not reach its poses.
     """
-    config = config or SimulateConfig()
+    config = config or SimulateConfig.from_keys()
     if rows < 1:
         raise InputError(f"--rows: simulate at least 1 row, not {rows}")
     machine = load_mechanism(mechanism, **config.mechanism_keys) if isinstance(mechanism, str) else mechanism
     sigma = _noise(noise, machine)
     wanted = [read_wanted(text) for text in effects]
     generator = torch.Generator().manual_seed(seed)
-    moving = config.rows == "trajectory" or (config.rows == "auto" and any(w.name == "latency" for w in wanted))
+    names = {w.name for w in wanted}
+    moving = config.rows == "trajectory" or (config.rows == "auto" and "latency" in names)
     joints, columns = (draw_moves if moving else draw_poses)(machine, rows, config, generator)
-    if any(w.name == Homing.name for w in wanted):
+    if Homing.name in names:
         columns["time"] = columns["time"] + _NIGHT * (torch.arange(rows) * _DAYS // rows)
-    down = default_gravity(machine) if config.gravity is None else torch.tensor(config.gravity, dtype=torch.float64)
-    torques = any(w.name == Sag.name for w in wanted)
-
-    def situation_at(joints: Tensor) -> Situation:
-        rows = Situation(machine, joints, columns, down)
-        return replace(rows, covariates=_kept(columns | (rest_torques(rows) if torques else {}), config.covariates))
-
-    situation = situation_at(joints)
+    situation = _situation(machine, joints, columns, config, Sag.name in names)
     acting = [act(w, situation, generator) for w in wanted if not w.outlier]
     check_bounds(situation, acting)
     frame = reached(situation, acting)
@@ -222,7 +216,7 @@ def simulate_records(
         joints = torch.where(lost[:, None], draw_poses(machine, rows, config, generator)[0], joints)
         first = torch.stack([columns[f"direction{i + 1}"][:1] for i in range(joints.shape[-1])], -1)
         columns |= directions(joints, first)
-        situation = situation_at(joints)
+        situation = _situation(machine, joints, columns, config, Sag.name in names)
         frame = reached(situation, acting)
         lost = ~torch.isfinite(frame).all(-1)
     if bool(lost.any()):
@@ -243,14 +237,31 @@ def simulate_records(
             injected.append(Injected(one.name, parameters, _rms(added)))
         else:
             injected.append(next(alone))
-    pose = measured_pose(situation, frame)
+    pose = _measured(situation, frame, sigma, generator)
+    kept = dict(situation.covariates)
+    return Simulated(machine, joints, pose, kept, tuple(injected), tuple(sorted(outliers)), gap)
+
+
+def _situation(
+    mechanism: Mechanism, joints: Tensor, columns: dict[str, Tensor], config: SimulateConfig, torques: bool
+) -> Situation:
+    gravity = (
+        default_gravity(mechanism) if config.gravity is None else torch.tensor(config.gravity, dtype=torch.float64)
+    )
+    situation = Situation(mechanism, joints, columns, gravity)
+    columns = columns | (rest_torques(situation) if torques else {})
+    return replace(situation, covariates=_kept(columns, config.covariates))
+
+
+def _measured(situation: Situation, frame: Tensor, sigma: Tensor, generator: torch.Generator) -> Tensor:
+    """Poses of the frames, with noise."""
+    machine, pose = situation.mechanism, measured_pose(situation, frame)
     errors = sigma * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
     pose = _moved(pose, errors, True) if machine.orientations and pose.shape[-1] == 6 else pose + errors
     if sees_directions(machine):
         # A direction has no length that could be measured.
         pose = pose * (situation.pose.norm(dim=-1) / pose.norm(dim=-1))[:, None]
-    kept = dict(situation.covariates)
-    return Simulated(machine, joints, pose, kept, tuple(injected), tuple(sorted(outliers)), gap)
+    return pose
 
 
 def _injected(situation: Situation, acting: Acting, nominal: Tensor) -> Injected:

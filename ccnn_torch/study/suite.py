@@ -26,18 +26,16 @@ from ccnn_torch.calibration.statistics import ratio
 from ccnn_torch.config.tree import apply_overrides, resolve_paths, validated
 from ccnn_torch.engine import Engine
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.write import write_whole
+from ccnn_torch.files.write import write_rows, write_whole
 from ccnn_torch.files.yaml_file import read_yaml
-from ccnn_torch.report.csv_file import write_rows
-from ccnn_torch.report.figures.style import save_figure
+from ccnn_torch.report.figures import save_figure
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.results.base import Spread
 from ccnn_torch.report.results.run import RunResults
 from ccnn_torch.report.results.suite import Case, Standing, SuiteResults, Summary
 from ccnn_torch.report.screen import say_place, stdout
 from ccnn_torch.study.runs import Study, run_study
-from ccnn_torch.study.suite_figure import suite_plot
-from ccnn_torch.study.suite_page import suite_page
+from ccnn_torch.study.suite_page import suite_page, suite_plot
 
 CLOSE = 1.05
 DEFINITIONS = {

@@ -14,7 +14,7 @@ from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.display import number_text
 from ccnn_torch.engine import check_engine
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.csv_file import write_rows
+from ccnn_torch.files.write import write_rows
 from ccnn_torch.report.results.base import Spread
 from ccnn_torch.report.results.run import PoseFigures, RunResults
 from ccnn_torch.report.screen import note, say_place, stdout

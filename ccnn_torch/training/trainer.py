@@ -96,9 +96,9 @@ def _seal(tensors: dict[str, Tensor], about: dict[str, Any]) -> str:
 def interrupts_held_back() -> Iterator[None]:
     """Within it an interrupt (SIGINT) waits; it acts once the block is left, as if it had come then.
 
-    A KeyboardInterrupt inside TensorBoard's queue leaves its lock taken, and closing the writer then waits for ever
-    (about one interrupt in a hundred that falls into a write); one inside a finalizer is dropped by Python. Only the
-    main thread gets signals, so that elsewhere, or where a program has a handler of its own, nothing is changed.
+    A callback is not left halfway: a record of an event file that was cut off would hide all later ones, and an
+    interrupt inside a finalizer is dropped by Python. Only the main thread gets signals, so that elsewhere, or where a
+    program has a handler of its own, nothing is changed.
     """
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:

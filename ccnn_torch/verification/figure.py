@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays
-from ccnn_torch.report.figures.style import AFTER, BEFORE, RASTER_ABOVE, Plot, styled
+from ccnn_torch.report.figures import AFTER, BEFORE, RASTER_ABOVE, Plot, styled
 
 
 @styled

@@ -16,8 +16,7 @@ from ccnn_torch.report.table import Table
 def write_verify_report(folder: Path, results: VerifyResults, arrays: RunArrays) -> list[Path]:
     """Write `verify.html` and `verify.json` into a folder, which is made."""
     # Imported here: it loads matplotlib.
-    from ccnn_torch.report.figures.errors import joint_error_plot, pose_error_plot
-    from ccnn_torch.report.figures.style import inline_figures
+    from ccnn_torch.report.figures import inline_figures, joint_error_plot, pose_error_plot
     from ccnn_torch.verification.figure import pose_rows_plot, predicted_plot
 
     plots = [pose_rows_plot(arrays), pose_error_plot(arrays), joint_error_plot(arrays)]

@@ -1,6 +1,6 @@
 """Effects against machines as built that know nothing of them: own closures, statics, heat and play.
 
-In `ccnn_torch.simulation.realistic` drives stiffen, backlash has a soft edge between friction and load, waves have two
+In `ccnn_validation.realistic` drives stiffen, backlash has a soft edge between friction and load, waves have two
 harmonics, and heat moves through bodies of three time constants, one of them warmed by the drives' own work. The
 share of the residual that an effect leaves at its best bounds what a diagnosis can conclude from it.
 """
@@ -11,10 +11,10 @@ from itertools import product
 
 import pytest
 import torch
+from ccnn_validation.realistic.machine import RealisticMachine, build_machine
 from torch import Tensor
 
 from ccnn_torch.effects import Situation, default_gravity, make_effect, pose_residual, signature
-from ccnn_torch.simulation.realistic import RealisticMachine, build_machine
 
 # Share of the root mean square that is left over; with the textbook form alone it is the second figure or more.
 LEFT = [

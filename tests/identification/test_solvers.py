@@ -14,8 +14,8 @@ from scipy.optimize import least_squares
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Problem
+from ccnn_torch.identification.solvers import SOLVERS, get_solver
 from ccnn_torch.identification.solvers.hga import FORBIDDEN, Objective
-from ccnn_torch.identification.solvers.registry import SOLVERS, get_solver
 
 SHORT = {"generations": 40}
 

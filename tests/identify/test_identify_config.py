@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from ccnn_torch.config.keys import list_keys
-from ccnn_torch.config.prior_sizes import prior_sizes
-from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.config.sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import identify

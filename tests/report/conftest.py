@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from report_runs import fill, tripod_run
 
-from ccnn_torch.calibration.page.report import write_report
+from ccnn_torch.calibration.figures import write_report
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.results.run import RunResults
 

@@ -14,13 +14,19 @@ from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.colors import LogNorm
 from report_runs import arm_run
 
-from ccnn_torch.calibration.page.figures import alive_nodes, convergence_plot, network_plot, population_plot
+from ccnn_torch.calibration.figures import alive_nodes, convergence_plot, network_plot, population_plot
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays
-from ccnn_torch.report.figures.errors import joint_error_plot, pose_error_plot
-from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure
-from ccnn_torch.report.figures.workspace import overview_plot, workspace_plot
+from ccnn_torch.report.figures import (
+    Plot,
+    inline_svg,
+    joint_error_plot,
+    overview_plot,
+    pose_error_plot,
+    save_figure,
+    workspace_plot,
+)
 from ccnn_torch.report.results.base import Spread, interval_text
 
 SVG = "{http://www.w3.org/2000/svg}"

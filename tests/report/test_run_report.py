@@ -19,14 +19,12 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from typer.testing import CliRunner
 
-from ccnn_torch.calibration.page.long_table import long_table
-from ccnn_torch.calibration.page.report import make_picture, write_report
-from ccnn_torch.calibration.page.tables import result_tables, run_page, verdict, worse_text
-from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback, tags_of
+from ccnn_torch.calibration.callbacks import EventFile, TensorBoardCallback, tags_of
+from ccnn_torch.calibration.figures import make_picture, write_report
+from ccnn_torch.calibration.page import long_table, result_tables, run_page, verdict, worse_text
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.cli.with_model import picture
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.event_file import EventFile
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.results.run import RmsMax, RunResults
 

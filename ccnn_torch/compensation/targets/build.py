@@ -259,21 +259,9 @@ class Builder:
                 return self.constant(float(OPERATIONS[op](*(np.float64(v) for v in values if v is not None))))
         first, second = args[0], args[-1]
         a, b = values[0], values[-1]
-        if op == "add" and 0.0 in (a, b):
-            return second if a == 0.0 else first
-        if op == "add":
-            for x, y in ((first, second), (second, first)):
-                if self._nodes[y].op == "neg":
-                    return self.apply("sub", x, self._nodes[y].args[0])
-        if op == "sub" and b == 0.0:
-            return first
-        if op == "sub" and a == 0.0:
-            return self.apply("neg", second)
-        if op == "sub" and self._nodes[second].op == "neg":
-            return self.apply("add", first, self._nodes[second].args[0])
-        if op == "not" and self._nodes[first].op == "not":
-            return self._nodes[first].args[0]
-        if op == "neg" and self._nodes[first].op == "neg":
+        if op in ("add", "sub"):
+            return self._sum(op, first, second)
+        if op in ("not", "neg") and self._nodes[first].op == op:
             return self._nodes[first].args[0]
         if op == "mul":
             return self._product(first, second)
@@ -296,6 +284,18 @@ class Builder:
             return args[1] if a else args[2]
         if op == "select" and args[1] == args[2]:
             return args[1]
+        return None
+
+    def _sum(self, op: str, first: int, second: int) -> int | None:
+        """Or difference, of a constant 0 or a negated node and another."""
+        if self._value(second) == 0.0:
+            return first
+        if self._value(first) == 0.0:
+            return second if op == "add" else self.apply("neg", second)
+        if self._nodes[second].op == "neg":
+            return self.apply("sub" if op == "add" else "add", first, self._nodes[second].args[0])
+        if op == "add" and self._nodes[first].op == "neg":
+            return self.apply("sub", second, self._nodes[first].args[0])
         return None
 
     def _product(self, first: int, second: int) -> int | None:

@@ -14,11 +14,10 @@ from torch.fx import GraphModule, Node
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
-from ccnn_torch.compensation.lowering import Lowering, operation_of
 from ccnn_torch.compensation.routines import ControllerFunctions, Routine, routines_of
 from ccnn_torch.compensation.targets.build import Builder
 from ccnn_torch.compensation.targets.form import BOOLEAN, Form, Program
-from ccnn_torch.compensation.targets.recording import recorded
+from ccnn_torch.compensation.targets.lowering import Lowering, operation_of, recorded
 
 # More elements, or products, are a loop over arrays; fewer are written out, without those of zeros.
 _ELEMENTS, _PRODUCTS = 512, 1024

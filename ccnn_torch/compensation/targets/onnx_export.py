@@ -24,9 +24,9 @@ from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
 from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, OUTPUTS, check_graph, open_onnx, run_onnx
 from ccnn_torch.compensation.routines import KEPT, Functions, execute, routines_of
 from ccnn_torch.compensation.targets.golden import Vectors, probe_points
+from ccnn_torch.compensation.targets.lowering import recorded
 from ccnn_torch.compensation.targets.onnx_graph import Graph, Value
 from ccnn_torch.compensation.targets.onnx_operations import ByTensors
-from ccnn_torch.compensation.targets.recording import recorded
 from ccnn_torch.errors import MethodFailedError
 
 # Rows of an example, or a few more.

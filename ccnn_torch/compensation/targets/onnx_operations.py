@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.fx import Node
 
-from ccnn_torch.compensation.lowering import Lowering, operation_of
+from ccnn_torch.compensation.targets.lowering import Lowering, operation_of
 from ccnn_torch.compensation.targets.onnx_graph import Graph, Value, batch_of
 from ccnn_torch.errors import MethodFailedError
 

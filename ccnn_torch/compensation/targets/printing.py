@@ -114,14 +114,11 @@ def print_program(program: Program, dialect: Dialect, tables: dict[bytes, str]) 
     Raises:
         MethodFailedError: the target lacks an operation.
     """
-    out = Text([], {}, {}, {})
     names = {buffer: name for name, buffer in program.inputs.items()}
-    for start, values in program.tables.items():
-        names[start] = tables.setdefault(values.tobytes(), f"table{len(tables)}")
-        out.tables[names[start]] = values
-    for k, buffer in enumerate(program.buffers):
-        names[buffer] = f"array{k}"
-        out.buffers[names[buffer]] = program.sizes[buffer]
+    names |= {start: tables.setdefault(v.tobytes(), f"table{len(tables)}") for start, v in program.tables.items()}
+    names |= {buffer: f"array{k}" for k, buffer in enumerate(program.buffers)}
+    constants = {names[start]: values for start, values in program.tables.items()}
+    out = Text([], {}, {names[buffer]: program.sizes[buffer] for buffer in program.buffers}, constants)
     texts: dict[int, str] = {}
     uses, looped = _uses(program)
 

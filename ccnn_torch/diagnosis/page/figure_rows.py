@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis.page.data import Signature, used_rows
 from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
-from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, GREY, RASTER_ABOVE, Plot, styled
+from ccnn_torch.report.figures import AFTER, BEFORE, FLOOR, GREY, RASTER_ABOVE, Plot, styled
 
 Array = NDArray[np.float64]
 _KELVIN = 273.15

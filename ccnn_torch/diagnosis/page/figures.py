@@ -17,8 +17,7 @@ from ccnn_torch.diagnosis.page.tables import shares
 from ccnn_torch.diagnosis.verdict.text import driver_words, floor_words, probability_words
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.motion.stretches import PHASES
-from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, styled
-from ccnn_torch.report.figures.workspace import draw_pairs, height_of, planes_of
+from ccnn_torch.report.figures import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, draw_pairs, height_of, planes_of, styled
 
 Block = Mapping[str, Any]
 _LIKE = SERIES[4]

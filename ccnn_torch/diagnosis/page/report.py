@@ -48,7 +48,7 @@ from ccnn_torch.report.page import InlineFigure, Page, Section
 from ccnn_torch.report.table import Table, print_text
 
 if TYPE_CHECKING:
-    from ccnn_torch.report.figures.style import Plot
+    from ccnn_torch.report.figures import Plot
 
 Block = Mapping[str, Any]
 Arrays = Mapping[str, NDArray[np.float64]]
@@ -93,7 +93,7 @@ def write_diagnosis_report(
     numbers, labels = load_tensors(folder / ARRAYS)[0], load_labels(folder)
     about = about_of(labels)
     # Here, so that `ccnn check` and the verdict on the terminal do not wait for matplotlib.
-    from ccnn_torch.report.figures.style import inline_figures
+    from ccnn_torch.report.figures import inline_figures
 
     write_whole(folder / _MARKDOWN, diagnosis_page(results, about).markdown())
     figures = inline_figures(_plots(results, numbers, labels, about), folder / "plots")

@@ -21,7 +21,7 @@ from ccnn_torch.diagnosis.verdict.text import (
     words_for,
 )
 from ccnn_torch.display import display_unit, number_text, own_unit, unit_text
-from ccnn_torch.report.csv_file import write_rows
+from ccnn_torch.files.write import write_rows
 from ccnn_torch.report.table import Table
 
 Block = Mapping[str, Any]

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.csv_file import write_rows
+from ccnn_torch.files.write import write_rows, write_whole
 from ccnn_torch.report.json_files import write_json
 from ccnn_validation.blind.tables import blind_markdown
 

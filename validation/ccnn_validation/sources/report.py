@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.csv_file import write_rows
+from ccnn_torch.files.write import write_rows, write_whole
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.table import Table, markdown_table
 from ccnn_validation.blind.report import share

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.learning.uncertainty import sd_scale
-from ccnn_torch.calibration.rows.dataset import Dataset
+from ccnn_torch.calibration.dataset import Dataset
+from ccnn_torch.calibration.uncertainty import sd_scale
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.records.splits import fold_splits

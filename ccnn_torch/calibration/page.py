@@ -7,22 +7,26 @@ the paper's cases its printed figures are listed beside ours. All numbers are me
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from ccnn_torch.calibration.page.long_table import HEADER, long_table
-from ccnn_torch.calibration.page.paper_tables import PAPER, PaperCase
 from ccnn_torch.display import count_text, display_unit, number_text
-from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.csv_file import write_rows
+from ccnn_torch.files.write import write_rows, write_whole
+from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.report.page import InlineFigure, Page, sections_of
-from ccnn_torch.report.results.base import interval_text, removed_percent
-from ccnn_torch.report.results.run import Method, ModelFiles, Mse, RunResults
+from ccnn_torch.report.results.base import Spread, interval_text, removed_percent
+from ccnn_torch.report.results.run import Before, Method, MethodPose, ModelFiles, Mse, RmsMax, RunResults
 from ccnn_torch.report.table import Table, table_of
 
 # By less a learned part may be worse on other rows by chance.
 _WORSE = 1.01
+
+
+def paper_case(case: str | None) -> dict[str, Any] | None:
+    """What the paper prints of a case, as `paper.yaml` has it; None where `results.case` is none of its cases."""
+    return None if case is None else read_yaml(Path(__file__).with_name("paper.yaml")).get(case.partition(":")[0])
 
 
 def run_page(results: RunResults, figures: Sequence[InlineFigure] = ()) -> Page:
@@ -88,7 +92,7 @@ def errors_line(results: RunResults) -> str:
 
 def result_tables(results: RunResults) -> list[Table]:
     """All tables of a run, in reading order."""
-    paper = PAPER.get(results.case or "")
+    paper = paper_case(results.case)
     tables = [
         _before_table(results, paper),
         comparison_table(results),
@@ -151,7 +155,7 @@ def _repeats(results: RunResults) -> str:
     return f"Medians [5 %, 95 %] over {count} repeats." if count > 1 else ""
 
 
-def _before_table(results: RunResults, paper: PaperCase | None) -> Table:
+def _before_table(results: RunResults, paper: dict[str, Any] | None) -> Table:
     units, train = _units(results), results.before_train
     columns = ["joint"] + ["mean, training rows", "maximum, training rows"] * (train is not None)
     columns += ["mean, held-out rows", "maximum, held-out rows", "largest by absolute value"]
@@ -165,15 +169,15 @@ def _before_table(results: RunResults, paper: PaperCase | None) -> Table:
             row += [interval_text(train[name].spread[key], scale) for key in ("mean", "max")]
         row += [interval_text(results.before[name].spread[key], scale) for key in ("mean", "max", "max_abs")]
         if paper:
-            row += [number_text(value / scale) for value in paper.before_test[i]]
+            row += [number_text(value / scale) for value in paper["before_test"][i]]
         rows.append(tuple(row))
     note = "Mean and maximum are of the signed error. " + _repeats(results)
     if paper:
-        note += f" Paper: Table {paper.before}, verification set. {paper.remark}"
+        note += f" Paper: Table {paper['before']}, verification set. {paper['remark']}"
     return Table("Joint error before calibration", tuple(columns), rows, note.strip())
 
 
-def _after_table(results: RunResults, paper: PaperCase | None, measure: str) -> Table:
+def _after_table(results: RunResults, paper: dict[str, Any] | None, measure: str) -> Table:
     titles = {"mse": "Mean squared error", "mae": "Mean absolute error", "sse": "Sum of squared errors"}
     floor = results.floor
     keys = list(_units(results)) + ["all"] * ("all" in (results.constant.test or {}))
@@ -193,7 +197,7 @@ def _after_table(results: RunResults, paper: PaperCase | None, measure: str) -> 
         if beside and (key == "seconds" or any(block[key] for block in blocks))
     ]
     columns += [column for _, column, _ in extras]
-    printed = dict(paper.methods) if paper and len(keys) == len(paper.symbols) + 1 else {}
+    printed = dict(paper["methods"]) if paper and len(keys) == len(paper["symbols"]) + 1 else {}
     rows: list[tuple[str, ...]] = []
 
     def add(label: str, errors: Mapping[str, Mse] | None, method: Method | None = None) -> None:
@@ -203,9 +207,9 @@ def _after_table(results: RunResults, paper: PaperCase | None, measure: str) -> 
 
     def add_printed(name: str) -> None:
         assert paper is not None
-        values = printed.pop(name)[("mse", "mae", "sse").index(measure)]
-        cells = [number_text(value / scales[key][0]) for key, value in zip(keys, values, strict=True)]
-        rows.append((f"{name}, paper's Table {paper.after}", *cells, *["–"] * len(extras)))
+        values = zip(keys, printed.pop(name)[measure], strict=True)
+        cells = [number_text(value / scales[key][0]) for key, value in values]
+        rows.append((f"{name}, paper's Table {paper['after']}", *cells, *["–"] * len(extras)))
 
     for name, method in results.methods.items():
         add(method_label(results, name), method.test, method)
@@ -360,3 +364,62 @@ def pose_by_method_table(results: RunResults) -> Table | None:
         for key, words in (("rms", "RMS"), ("max", "max")):
             columns[f"{kind} {words} [{unit}]"] = [interval_text(rows[kind][key], scale) for rows in shown.values()]
     return table_of("Pose error on held-out rows, method by method", columns)
+
+
+HEADER = ("method", "split", "quantity", "joint", "unit", "median", "low", "high")
+Row = tuple[str, str, str, str, str, float | None, float | None, float | None]
+_OF_A_METHOD = (
+    ("ratio_to_floor", "test", "1"),
+    ("coverage", "test", "1"),
+    ("seconds", "", "s"),
+    ("evaluations", "", "1"),
+    ("converged", "", "1"),
+)
+
+
+def long_table(results: RunResults) -> Iterator[Row]:
+    """Rows of (method, split, quantity, joint, unit, median, low, high); `joint` is empty where it means nothing."""
+    units = {joint.name: joint.unit for joint in results.joints}
+    units["all"] = results.joints[0].unit
+    best = results.best_method or ""
+
+    def row(method: str, split: str, quantity: str, joint: str, unit: str, spread: Spread) -> Row:
+        return (method, split, quantity, joint, unit, spread.median, spread.low, spread.high)
+
+    def pose(method: str, kind: str, unit: str, figures: RmsMax | MethodPose) -> Iterator[Row]:
+        for measure in ("rms", "max"):
+            yield row(method, "test", f"{kind}_{measure}", "", unit, figures[measure])
+
+    def before(split: str, figures: dict[str, Before]) -> Iterator[Row]:
+        for joint, block in figures.items():
+            for quantity, spread in block.spread.items():
+                yield row("before", split, quantity, joint, units[joint], spread)
+
+    yield from before("train", results.before_train or {})
+    yield from before("test", results.before)
+    methods = results.methods
+    tests = {name: method.test for name, method in methods.items()}
+    tests["constant"] = tests.get("constant") or results.constant.test
+    errors: dict[str, Mapping[str, Mse] | None] = dict(tests)
+    if results.floor is not None:
+        errors |= {f"floor_{kind}": results.floor[kind] for kind in ("realised", "expected", "with_unlearnable")}
+    for method, joints in errors.items():
+        for joint, measures in (joints or {}).items():
+            for quantity, spread in measures:
+                unit = units[joint] if quantity == "mae" or units[joint] == "1" else f"{units[joint]}^2"
+                yield row(method, "test", quantity, joint, unit, spread)
+    trained = {name: block for name, block in methods.items() if block.test is not None}
+    for method, block in ({"constant": results.constant} | trained).items():
+        for quantity, split, unit in _OF_A_METHOD:
+            if block[quantity] is not None:
+                yield row(method, split, quantity, "", unit, block[quantity])
+        for joint, spread in block.sd.items():
+            yield row(method, "test", "sd", joint, units[joint], spread)
+        for kind, left in block.pose.items():
+            # That of the best method is written below, with the error before compensation.
+            if left is not None and method != best:
+                yield from pose(method, kind, left.unit, left)
+    for kind, figures in results.pose:
+        for when in ("before", "after", "explained", "geometry", "effects", "not_compensable"):
+            if figures is not None and figures[when] is not None:
+                yield from pose(best if when == "after" else when, kind, figures.unit, figures[when])

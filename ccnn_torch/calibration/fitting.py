@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.learning.early_stop import (
+from ccnn_torch.calibration.dataset import Dataset
+from ccnn_torch.calibration.early_stop import (
     Choice,
     Plan,
     WatchPhase,
@@ -17,7 +18,6 @@ from ccnn_torch.calibration.learning.early_stop import (
     moved,
     predictive_variance,
 )
-from ccnn_torch.calibration.rows.dataset import Dataset
 from ccnn_torch.compensation.networks import describe_network
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner, TrainingData

@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
-from ccnn_torch.calibration.learning.early_stop import Choice, Plan, WatchPhase, choose
-from ccnn_torch.calibration.rows.dataset import Dataset
+from ccnn_torch.calibration.dataset import Dataset
+from ccnn_torch.calibration.early_stop import Choice, Plan, WatchPhase, choose
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner

@@ -6,7 +6,7 @@ import torch
 from scipy.special import ndtri, stdtrit
 from torch import Tensor
 
-from ccnn_torch.calibration.rows.dataset import Dataset
+from ccnn_torch.calibration.dataset import Dataset
 from ccnn_torch.compensation import Domain
 
 # scipy.special's quantiles are those of scipy.stats, which takes half a second to load.

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import io
+import itertools
 import math
+import os
+import socket
+import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -15,7 +20,10 @@ from numpy.typing import ArrayLike
 from PIL import Image
 from torch import Tensor
 
-from ccnn_torch.report.event_file import EventFile
+from ccnn_torch.calibration.dataset import Dataset
+from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.report.screen import progress_bar
+from ccnn_torch.training import Scaling
 
 _PER_SUBPOPULATION = ("density", "diversity")
 _CURVES = ("heldout_mse_", "error_")
@@ -178,3 +186,164 @@ def tags_of(name: str, value: Tensor | float) -> dict[str, float]:
         if repeats > 1 and bool(column[0].isfinite()):
             tags[f"repeat_0/{tag}"] = float(column[0])
     return tags
+
+
+_numbers = itertools.count()
+
+
+class EventFile:
+    """One event file, written by the calling thread.
+
+    torch's own `SummaryWriter` writes in a thread of its own, whose exception on a full disk cannot be caught. Here the
+    file ends with the last whole record, `failed` gives the reason, and later records are dropped: the run continues.
+    """
+
+    def __init__(self, folder: Path, purge_step: int | None = None) -> None:
+        """Open a new file.
+
+        Args:
+            folder: made where it is not there.
+            purge_step: TensorBoard ignores the records of older files of this folder from this step on.
+        """
+        # Only runs that write curves should pay for the import; torch's own `summary` costs more than all of these.
+        from tensorboard.compat.proto import event_pb2, summary_pb2
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        self._event: Any = event_pb2.Event
+        self._summary: Any = summary_pb2.Summary
+        self._pending = io.BytesIO()
+        self._records = RecordWriter(self._pending)
+        self._file: io.FileIO | None = None
+        self.failed: str | None = None
+        # TensorBoard reads the files of a folder in the order of their names, and two may begin within a second.
+        seconds, rest = divmod(time.time_ns(), 1_000_000_000)
+        name = f"events.out.tfevents.{seconds:010}.{rest:09}.{socket.gethostname()}.{os.getpid()}.{next(_numbers):06}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = io.FileIO(folder / name, "w")
+        except OSError as reason:
+            self.failed = reason.strerror
+        self._add(None, file_version="brain.Event:2")
+        if purge_step is not None:
+            self._add(None, step=purge_step, file_version="brain.Event:2")
+            self._add(None, step=purge_step, session_log={"status": event_pb2.SessionLog.START})
+
+    def add_scalar(self, tag: str, number: float, step: int, walltime: float | None = None) -> None:
+        self._add_value(step, walltime, tag=tag, simple_value=number)
+
+    def add_image(self, tag: str, png: bytes, step: int) -> None:
+        """png: content of a PNG file, whose header has the size."""
+        width, height = struct.unpack(">II", png[16:24])
+        self._add_value(step, tag=tag, image={"width": width, "height": height, "encoded_image_string": png})
+
+    def flush(self) -> None:
+        """Write the added records to the file, so that TensorBoard sees them."""
+        content = memoryview(self._pending.getvalue())
+        self._pending.seek(0)
+        self._pending.truncate()
+        if self._file is None:
+            return
+        whole = self._file.tell()
+        try:
+            while content:
+                # A disk that fills up may accept a part.
+                content = content[self._file.write(content) or 0 :]
+        except OSError as reason:
+            self.failed = reason.strerror
+            self._file.truncate(whole)
+            self._file.close()
+            self._file = None
+
+    def close(self) -> None:
+        self.flush()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _add_value(self, step: int, walltime: float | None = None, **content: Any) -> None:
+        self._add(walltime, step=step, summary=self._summary(value=[self._summary.Value(**content)]))
+
+    def _add(self, walltime: float | None, **content: Any) -> None:
+        event = self._event(wall_time=time.time() if walltime is None else walltime, **content)
+        self._records.write(event.SerializeToString())
+
+
+def genome(learner: Learner, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
+    """Masks `out x in` and weights `out x in [+ 1]` of one repeat's network; empty for a learner without masks."""
+    found = getattr(learner, "genome", None)
+    return ([], []) if found is None else found(repeat)
+
+
+class ProgressBar:
+    """One line on stderr: what is trained, steps done, time left, the error so far. Silent off a terminal."""
+
+    def __init__(self, label: str, quiet: bool) -> None:
+        self._label = label
+        self._progress = progress_bar(quiet, steps=True)
+
+    def on_start(self, learner: Learner, data: TrainingData, step: int) -> None:
+        self._task = self._progress.add_task(self._label, total=learner.steps, completed=step, note="")
+        self._progress.start()
+
+    def on_step(self, step: int, metrics: dict[str, Tensor]) -> None:
+        note = ""
+        for name, text in (("error_validation", "validation mse"), ("error_train", "training error")):
+            if name in metrics:
+                note = f"{text} {float(metrics[name].median()):.4g} (standardised)"
+                break
+        self._progress.update(self._task, completed=step, note=note)
+
+    def on_end(self) -> None:
+        self._progress.stop()
+
+
+@dataclass
+class HeldOut:
+    """Adds the held-out mse [SI²], mae [SI] and sse [SI²] of every joint to the metrics of a step, to be watched.
+
+    Nothing is chosen by these figures: they are for the curves alone.
+    """
+
+    dataset: Dataset
+    scaling: Scaling
+    joints: tuple[str, ...]
+    one_unit: bool
+    every: int = 1
+    last: dict[str, Tensor] = field(default_factory=dict)
+
+    def on_start(self, learner: Learner, data: TrainingData, step: int) -> None:
+        rows = self.dataset.usable_rows("test")
+        device = data.inputs.device
+        inputs = rows.take(self.dataset.inputs)
+        self._learner = learner
+        self._features = self.scaling.features(inputs).to(device)
+        self._truth = rows.take(self.dataset.deviation)
+        self._weights = rows.weights
+
+    def on_step(self, step: int, metrics: dict[str, Tensor]) -> None:
+        if step % self.every == 0 or not self.last or self._learner.finished:
+            self.last = self._errors()
+        metrics.update(self.last)
+
+    def on_end(self) -> None:
+        pass
+
+    def _errors(self) -> dict[str, Tensor]:
+        predicted = self.scaling.restore(self._learner.predict(self._features).cpu())
+        error = (predicted - self._truth) * self._weights.unsqueeze(-1)
+        rows = self._weights.sum(-1, keepdim=True)
+        squared, absolute = error.square().sum(1), error.abs().sum(1)
+        errors: dict[str, Tensor] = {}
+        for j, joint in enumerate(self.joints):
+            errors[f"heldout_mse_{joint}"] = squared[:, j] / rows[:, 0]
+            errors[f"heldout_mae_{joint}"] = absolute[:, j] / rows[:, 0]
+            errors[f"heldout_sse_{joint}"] = squared[:, j]
+        if self.one_unit:
+            errors["heldout_mse_all"] = squared.mean(-1) / rows[:, 0]
+        return {name: value.to(torch.float64) for name, value in errors.items()}

@@ -13,13 +13,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.calibration.choice import ModelChoice, choose_model
 from ccnn_torch.calibration.config import RunConfig, method_names
-from ccnn_torch.calibration.geometry.choice import ModelChoice, choose_model
-from ccnn_torch.calibration.geometry.effects_search import search_effects
-from ccnn_torch.calibration.geometry.frame_drift import without_frame_drift
-from ccnn_torch.calibration.geometry.frames import frames_of_repeats
-from ccnn_torch.calibration.geometry.physics import Physics, fit_physics, verdict_of
-from ccnn_torch.calibration.rows.dataset import Dataset, by_repeat, dataset_of
+from ccnn_torch.calibration.dataset import Dataset, by_repeat, dataset_of
+from ccnn_torch.calibration.effects_search import search_effects, without_frame_drift
+from ccnn_torch.calibration.physics import Physics, fit_physics, frames_of_repeats, verdict_of
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
@@ -30,8 +28,7 @@ from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.load import fewest_rows
 from ccnn_torch.records.splits import Column, Split
-from ccnn_torch.simulation.case_study import Simulation, build_case, simulate_realistic
-from ccnn_torch.simulation.realistic import build_machine
+from ccnn_torch.simulation.case_study import Simulation, build_case
 
 # Of the realistic machines.
 _MOST_JOINTS = 6
@@ -158,6 +155,8 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
 
 
 def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
+    from ccnn_validation.realistic.machine import build_machine, simulate_realistic
+
     about = config.realistic
     doubts = check_memory(config, about.rows, _MOST_JOINTS)
     machine = build_machine(about.machine, about.cause, about.strength, about.rows, about.noise, seeds)

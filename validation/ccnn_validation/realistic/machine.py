@@ -14,7 +14,8 @@ from ccnn_torch.config.sizes import ANGLE_ARM
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import Mechanism, PoseError
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
-from ccnn_torch.simulation.structure import ArmStructure, Structure, machine_tool_structure, tripod_structure
+from ccnn_torch.simulation.case_study import Simulation
+from ccnn_validation.realistic.structure import ArmStructure, Structure, machine_tool_structure, tripod_structure
 
 CAUSES = ("geometry", "compliance", "transmission", "thermal", "backlash", "mixed")
 _MIXED = 0.5
@@ -354,3 +355,20 @@ def _displaced(mechanism: Mechanism, pose: Tensor, step: Tensor) -> Tensor:
         return pose + step
     rotation = rotation_vector_to_matrix(step[..., -3:]) @ rotation_vector_to_matrix(pose[..., -3:])
     return torch.cat([pose[..., :-3] + step[..., :-3], matrix_to_rotation_vector(rotation)], dim=-1)
+
+
+def simulate_realistic(
+    machine: RealisticMachine, deviations: Callable[[Tensor], Tensor], measured: Tensor
+) -> Simulation:
+    """A machine as built, which repeats exactly: propagate the noise of the measurement to the joints.
+
+    Args:
+        machine: the rows.
+        deviations: joint deviations of poses, `r x s x p` -> `r x s x n` [SI].
+        measured: those of the measured poses, `r x s x n` [SI].
+    """
+    true = deviations(machine.reached)
+    # One degree of freedom of the pose at a time: the noise is far below the curvature of the kinematics.
+    parts = [(deviations(machine.shifted(i)) - true).square() for i in range(len(machine.sd))]
+    variance = torch.stack(parts).sum(0)
+    return Simulation(machine.pose, measured - true, variance, lambda command: (machine.pose_error(command),) * 2)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.rows.dataset import Dataset
+from ccnn_torch.calibration.dataset import Dataset, pad_rows
 from ccnn_torch.compensation import machine_parts
 from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Known, Verdict, read_verdict
 from ccnn_torch.diagnosis.from_records import in_own_base
@@ -29,7 +29,7 @@ from ccnn_torch.effects import (
     without_pose_effects,
 )
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_unknown, judge_frames
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
@@ -248,3 +248,27 @@ def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) ->
             f"{what}; the column is there but no input of this run, because it is constant or not among covariates: "
             "name it there, give records in which it varies, or write effects=none"
         )
+
+
+def frames_of_repeats(mechanism: Mechanism, records: Records, splits: list[Split]) -> tuple[Tensor | None, list[str]]:
+    """Fit frames that are unknown to the rows of each repeat that are not held out.
+
+    Returns:
+        All parameters, nominal but for the frames, `r x 1 x k`, or `r x s x k` where frames are per group; None where
+        all frames are known; and notes.
+    """
+    rows = pad_rows([Dataset.part(split, "fit") for split in splits])
+    weights = torch.zeros(len(splits), len(records.joints), dtype=torch.float64)
+    weights.scatter_add_(1, rows.index, rows.weights)
+    parameters = fit_unknown(mechanism, records.joints, records.pose, weights, records.columns)
+    if parameters is None:
+        return None, []
+    if not mechanism.grouped:
+        parameters = parameters.unsqueeze(-2)
+    notes = []
+    if isinstance(mechanism, SerialArm):
+        about = (records.joints, records.pose, parameters, weights, records.path, records.name_rows)
+        notes += judge_frames(mechanism, *about)
+    unknown = " and ".join(getattr(mechanism, "unknown_frames", ()))
+    notes.append(f"Frames fitted first, on the training rows of each repeat: {unknown}.")
+    return parameters, notes

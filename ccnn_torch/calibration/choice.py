@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.geometry.frames import frames_of_repeats
-from ccnn_torch.calibration.geometry.physics import fit_physics
-from ccnn_torch.calibration.learning.early_stop import Plan
-from ccnn_torch.calibration.learning.fitting import fit_method
-from ccnn_torch.calibration.rows.dataset import dataset_of, rows_of
+from ccnn_torch.calibration.dataset import dataset_of, rows_of
+from ccnn_torch.calibration.early_stop import Plan
+from ccnn_torch.calibration.fitting import fit_method
+from ccnn_torch.calibration.physics import fit_physics, frames_of_repeats
 from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import make_learner
