@@ -14,7 +14,7 @@ is known. Behind a flexible joint, load and weight hang on a spring that pulls a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -22,9 +22,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.motion.stage import ABSENT, GAMMA, TINY, Rule, load_inertia, wave_of
+from ccnn_torch.motion.compilable import is_compiled, loop
+from ccnn_torch.motion.stage import (
+    ABSENT,
+    TINY,
+    Axis,
+    Course,
+    State,
+    axis_of,
+    begun,
+    compiled,
+    load_inertia,
+    plainly,
+    wave_of,
+)
 
 Array = NDArray[np.float64]
+Move = Callable[[Axis, State, Course, NDArray[np.int64]], Array]
+"""`plainly` or `compiled`."""
 # Steps longer than this, in units of the axis' own time constant, are divided.
 _LONGEST, _MOST_PARTS = 0.6, 8
 
@@ -73,12 +88,13 @@ def delayed(time: Tensor, values: Tensor, delay: Tensor) -> Tensor:
     return (x0 + (x1 - x0) * share).reshape(b, p, s).transpose(0, 1)
 
 
-def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
+def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor], move: Move | None = None) -> Tensor:
     """Positions of axes.
 
     Args:
         drive: of `b` runs.
         parameters: any of `ABSENT` by name, each broadcastable to `p x b`.
+        move: what goes from sample to sample; None = compiled where numba is installed, else `plainly`.
 
     Returns:
         `p x b x s` [rad or m]; the first dimension is 1 where all parameters' are.
@@ -105,7 +121,7 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
         # The other half of it resists the speed, within the limit of the motor.
         damping = a["gain"] * a["derivative"]
         a |= {n: a[n] + damping for n in ("viscous", "drive_damping")}
-    moved = _moved(drive, steps, commands, push, a)
+    moved = _moved(drive, steps, commands, push, a, move or (compiled if is_compiled() else plainly))
     if np.any(a["play"] > 0):
         loaded = a["play_loaded"] > 0
         driven = played(moved, a["play"] / 2)
@@ -115,65 +131,25 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     return torch.from_numpy(moved).permute(1, 2, 0)
 
 
-def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[str, Array]) -> Array:
+def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[str, Array], move: Move) -> Array:
     """What the encoder shows but for a play, `s x p x b`."""
     # The fastest motion of an axis is that of its mass on the gain: each has steps of its own, whatever is beside it.
     masses = a["inertia"] / np.maximum(a["gain"], TINY)
     fast = np.sqrt(np.where(masses > 0, masses, math.inf))
-    many = np.clip(np.ceil(np.median(steps, 0) / np.maximum(fast, TINY) / _LONGEST), 1, _MOST_PARTS)
-    found = np.empty_like(u)
-    for parts in np.unique(many):
-        here = many == parts
-        if here.all():
-            return _divided(drive, steps, u, push, a, int(parts))
-        runs = np.nonzero(here)[1]
-        own = Drive._make(None if v is None else v[runs] for v in drive)
-        some = None if push is None else push[:, here]
-        values = {name: value[here] for name, value in a.items()}
-        found[:, here] = _divided(own, steps[:, runs], u[:, here], some, values, int(parts))
-    return found
-
-
-def _divided(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[str, Array], parts: int) -> Array:
-    """The same of axes all of whose steps are divided into so many parts; `...` is `p x b`, or what was chosen of it.
-
-    Args:
-        drive: of the runs of the last dimension.
-        steps: of time, `(s - 1) x b`.
-        u, push: `s x ...`.
-        a: parameters, `...`.
-        parts: of a step.
-    """
-    start = drive.start.numpy()
-    q, v = (np.broadcast_to(start[:, k], u.shape[1:]) for k in range(2))
-    faster = start[:, 2] if start.shape[1] > 2 else np.zeros(len(start))
-    rule = Rule(a)
-    state = rule.begun(q, v, faster, u[0], None if push is None else push[0])
-    share = None
-    if np.any(a["supply"]) and drive.supply is not None and bool((drive.supply != 0).any()):
-        share = [np.maximum(1 + a["supply"] * supply, 0) for supply in drive.supply.numpy().T]
-    warm = drive.warm.numpy().T if np.any(a["thermal"]) and drive.warm is not None else None
-    bend = None if drive.bent is None else _bend(u) * drive.bent.numpy()
-    found = np.empty_like(u)
-    found[0] = q
-    ahead = (1 - GAMMA) / GAMMA
-    for k in range(len(steps)):
-        h = steps[k] * (GAMMA / parts)
-        dry = a["coulomb"] if warm is None else a["coulomb"] * np.maximum(1 + a["thermal"] * warm[k], 0)
-        fixed = rule.fixed(h, None if share is None else share[k + 1], dry)
-        slope = (u[k + 1] - u[k]) / parts
-        for i in range(parts):
-            before = u[k] + i * slope
-            ends = [(i + c) / parts for c in (GAMMA, 1.0)]
-            against = [None if push is None else _between(push, k, end) for end in ends]
-            asked = [before + c * slope for c in (GAMMA, 1.0)]
-            if bend is not None:
-                asked = [one + end * (1 - end) * bend[k] for one, end in zip(asked, ends, strict=True)]
-            middle = rule.step(state, asked[0], fixed, against[0])
-            between = tuple(one + ahead * (other - one) for one, other in zip(state, middle, strict=True))
-            state = rule.step(between, asked[1], fixed, against[1])
-        found[k + 1] = rule.read(state)
-    return found
+    many = np.clip(np.ceil(np.median(steps, 0) / np.maximum(fast, TINY) / _LONGEST), 1, _MOST_PARTS).astype(np.int64)
+    shape, none = u.shape[1:], np.zeros((1, *u.shape[1:]))
+    start, axis = drive.start.numpy(), axis_of(a)
+    q, v, faster = (np.broadcast_to(start[:, k], shape) if k < start.shape[1] else np.zeros(shape) for k in range(3))
+    state = begun(axis, a, q, v, faster, u[0], none[0] if push is None else push[0])
+    bend = none if drive.bent is None else _bend(u) * drive.bent.numpy()
+    supply, warm = (
+        none if values is None or not np.any(a[name]) else np.broadcast_to(values.numpy().T[:, None], u.shape)
+        for name, values in (("supply", drive.supply), ("thermal", drive.warm))
+    )
+    step = np.broadcast_to(steps[:, None], (len(steps), *shape))
+    course = Course(*(v.reshape(len(v), -1) for v in (step, u, bend, none if push is None else push, supply, warm)))
+    flat, state = Axis(*(v.ravel() for v in axis)), State(*(v.ravel() for v in state))
+    return move(flat, state, course, many.ravel()).reshape(u.shape)
 
 
 def _bend(u: Array) -> Array:
@@ -197,6 +173,7 @@ def _held_at(drive: Drive, push: Array | None, a: Mapping[str, Array]) -> Array:
     return np.asarray(q + load / np.maximum(a["gain"], TINY))
 
 
+@loop
 def _limited(steps: Array, u: Array, fastest: Array, begin: Array) -> Array:
     """Commands that change no faster than [rad/s], and may be behind already where they begin, `p x b`."""
     found = u.copy()
@@ -213,14 +190,20 @@ def _lead(steps: Array, u: Array, derivative: Array, integral: Array) -> Array:
     step, rise = steps[:, None], np.diff(u, axis=0)
     inner = (rise[1:] + rise[:-1]) / (step[1:] + step[:-1])
     found: Array = derivative * np.concatenate([rise[:1] / step[:1], inner, rise[-1:] / step[-1:]])
-    if np.any(integral):
-        change = np.diff(found, axis=0)
-        for k in range(len(steps)):
-            fades = 0.5 * integral * steps[k]
-            found[k + 1] = (found[k] * (1 - fades) + change[k]) / (1 + fades)
+    return _faded(steps, found, integral) if np.any(integral) else found
+
+
+@loop
+def _faded(steps: Array, lead: Array, integral: Array) -> Array:
+    found = lead.copy()
+    for k in range(len(steps)):
+        fades = 0.5 * integral * steps[k]
+        faded = (found[k] * (1 - fades) + lead[k + 1] - lead[k]) / (1 + fades)
+        found[k + 1] = np.where(integral > 0, faded, lead[k + 1])
     return found
 
 
+@loop
 def played(q: Array, half: Array) -> Array:
     """The driven side of a play, which rests in the middle at first."""
     found = q.copy()
@@ -231,32 +214,27 @@ def played(q: Array, half: Array) -> Array:
 
 def hung(steps: Array, q: Array, push: Array | None, a: Mapping[str, Array]) -> Array:
     """The driven side of a play, which is free between its ends but for its friction, and does not bounce there."""
-    fall, hang = _falling(a)
-    inertia, half = load_inertia(a), a["play"] / 2
+    weight, hang = wave_of(a["gravity_sin"], a["gravity_cos"])
+    inertia = load_inertia(a)
     light = np.where(inertia > 0, 1 / np.maximum(inertia, TINY), 0.0)
-    found = q.copy()
+    # Accelerations by which the weight and the other joints turn it back [rad/s^2].
+    pushed = np.zeros((1, *q.shape[1:])) if push is None else push * light
+    return _hung(steps, q, pushed, weight * light, hang, a["play"] / 2, a["play_friction"])
 
-    def pulled(x: Array, k: int) -> Array:
-        return np.asarray(fall * np.sin(x + hang) + (0.0 if push is None else push[k] * light))
 
-    x, v = q[0] - half * np.sign(pulled(q[0], 0)), np.zeros_like(q[0])
+@loop
+def _hung(steps: Array, q: Array, push: Array, fall: Array, hang: Array, half: Array, friction: Array) -> Array:
+    found, v = q.copy(), np.zeros_like(q[0])
+    x = q[0] - half * np.sign(fall * np.sin(q[0] + hang) + push[0])
     found[0] = x
     for k in range(len(steps)):
         h = steps[k]
-        v = v - h * pulled(x, k)
+        v = v - h * (fall * np.sin(x + hang) + push[min(k, len(push) - 1)])
         # Its bearing brakes it, up to standstill.
-        v = np.sign(v) * np.maximum(np.abs(v) - h * a["play_friction"], 0.0)
+        v = np.sign(v) * np.maximum(np.abs(v) - h * friction, 0.0)
         free = x + h * v
-        low, high = q[k + 1] - half, q[k + 1] + half
-        held = np.minimum(np.maximum(free, low), high)
+        held = np.minimum(np.maximum(free, q[k + 1] - half), q[k + 1] + half)
         v = np.where(held == free, v, (q[k + 1] - q[k]) / h)
         x = held
         found[k + 1] = x
     return found
-
-
-def _falling(a: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Size and phase of the acceleration by which the weight turns the far side of a joint back [rad/s^2]."""
-    weight, hang = wave_of(a["gravity_sin"], a["gravity_cos"])
-    inertia = load_inertia(a)
-    return np.where(inertia > 0, weight / np.maximum(inertia, TINY), 0.0), hang

@@ -15,6 +15,7 @@ from ccnn_torch.motion.effects import EFFECTS, Facts, motion_effects
 from ccnn_torch.motion.library import library_of
 from ccnn_torch.motion.search import with_gain
 from ccnn_torch.motion.spec import Spec
+from ccnn_torch.motion.stage import compiled, plainly
 
 
 def axis(time: np.ndarray, asked: np.ndarray, **parameters: float) -> np.ndarray:
@@ -190,6 +191,24 @@ def test_an_axis_moves_the_same_beside_any_other() -> None:
     beside = lot(sets, command(0, TIME))
     for one, row in zip(sets, beside, strict=True):
         assert np.array_equal(lot([one], command(0, TIME))[0], row), one
+
+
+def test_compiled_or_not_an_axis_moves_the_same() -> None:
+    time = torch.from_numpy(TIME).expand(2, -1)
+    asked = torch.stack([torch.from_numpy(command(k, TIME)) for k in (0, 1)])
+    start = torch.stack([asked[:, 0], asked.new_tensor([0.0, 0.4]), asked.new_tensor([0.0, 2.0])], -1)
+    uneven = {"supply": 0.1 * torch.sin(time), "warm": 5 * time, "torque": 0.01 * torch.cos(time)}
+    drive = Drive(time, asked, start, **uneven, bent=asked.new_tensor([0.0, 0.9]))
+    generator = torch.Generator().manual_seed(0)
+    names, sets = list(ABSENT), 40
+    # Each of the sets has some of what an axis may have.
+    has = torch.rand(len(names), sets, 1, generator=generator) < 0.4
+    sizes = torch.rand(len(names), sets, 1, generator=generator, dtype=torch.float64)
+    many = {"cogging_order": 20.0, "gain": 2.0, "stribeck_speed": 0.5, "weakness": 8.0, "integral": 4.0}
+    values = {n: torch.where(h, many.get(n, 0.05) * v, ABSENT[n]) for n, h, v in zip(names, has, sizes, strict=True)}
+    ways = [simulate_axes(drive, values, move) for move in (plainly, compiled)]
+    assert ways[0].std() > 0.1
+    torch.testing.assert_close(*ways, rtol=0, atol=1e-10)
 
 
 def test_the_last_digit_of_a_command_decides_nothing() -> None:
