@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -31,9 +33,12 @@ def is_compiled() -> bool:
 
 
 def loop(function: F) -> F:
-    """The function, compiled at its first call; later processes find it on the disk, until its own file changes."""
+    """The function, compiled at its first call; later processes find it on the disk, until a file here changes."""
     if numba is None:
         return function
+    # Numba looks at the file of the function alone, not at those of what it calls.
+    sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+    function.__qualname__ += f"_{zlib.crc32(sources):08x}"
     return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
 
 

@@ -27,6 +27,8 @@ _BEAM, _FITTED, _MOST = 2, 4, 9
 _DIGITS = 3
 # Log posterior that a level must bring.
 _GAINED = 1.0
+# Stretches in which sets are looked for.
+_SCREENED = 16
 # Sets that are fitted anew under another noise.
 _KEPT = 6
 _LONG, _SHORT, _FEW = 8, 5, 3
@@ -62,11 +64,13 @@ def log_posterior(fit: Fit) -> float:
 
 def search(problem: Problem) -> Search:
     """Find the probable sets of every axis."""
-    n = len(problem.followed)
-    plain = _Pool(problem, white_noise(n))
+    n, count = len(problem.followed), len(problem.data.run)
+    # Sets are looked for in some of the stretches, and fitted to all.
+    few = problem.of(torch.linspace(0, count - 1, _SCREENED).round().long()) if count > _SCREENED else problem
+    plain = _Pool(few, white_noise(n))
     plain.forward()
     largest = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
-    pool = _Pool(problem, fitted_whitening(problem.pooled(largest), problem.judged))
+    pool = _Pool(few, fitted_whitening(problem.pooled(largest), problem.judged))
     pool.again(plain)
     pool.forward()
     # The noise of what is left by what is most probable now.

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ccnn_torch.motion.compilable import compilable, fixed_tuple, loop, pick
+from ccnn_torch.motion.compilable import compilable, pick
 
 ABSENT: dict[str, float] = {
     "gain": 1.0,
@@ -73,6 +73,9 @@ class Axis(NamedTuple):
         inertia: of the motor's side where a load hangs on a spring.
         hung: 1 where it does: a load of no inertia does not pull at the motor, and its weight stays there.
         stiffness, slack, drag: of that spring, one over it, and its damping over it.
+        whole: inertia of motor and load.
+        damping: part of `viscous` and `drive_damping` that the derivative gain makes.
+        light: one over the inertia behind a play.
     """
 
     gain: Array
@@ -98,6 +101,15 @@ class Axis(NamedTuple):
     stiffness: Array
     slack: Array
     drag: Array
+    whole: Array
+    delay: Array
+    slowness: Array
+    derivative: Array
+    damping: Array
+    play: Array
+    play_loaded: Array
+    play_friction: Array
+    light: Array
 
 
 class Has(NamedTuple):
@@ -111,6 +123,10 @@ class Has(NamedTuple):
     waves: Any
     soft: Any
     weak: Any
+    slow: Any
+    led: Any
+    play: Any
+    hung: Any
 
 
 class State(NamedTuple):
@@ -164,48 +180,30 @@ class Sample(NamedTuple):
     warm: Array
 
 
-class Course(NamedTuple):
-    """What `c` axes are given at `s` samples, as in `Sample`; what is nothing has one sample.
-
-    Attributes:
-        step, bend: from each sample to the next, `(s - 1) x c`.
-        command, push, supply, warm: `s x c`.
-    """
-
-    step: Array
-    command: Array
-    bend: Array
-    push: Array
-    supply: Array
-    warm: Array
-
-
-@compilable
-def sample_of(course: Course, k: int) -> Sample:
-    """From sample `k` to the next."""
-    step, command, bend, push, supply, warm = course
-    return Sample(
-        step[k],
-        command[k],
-        command[k + 1],
-        bend[min(k, len(bend) - 1)],
-        push[min(k, len(push) - 1)],
-        push[min(k + 1, len(push) - 1)],
-        supply[min(k + 1, len(supply) - 1)],
-        warm[min(k, len(warm) - 1)],
-    )
-
-
 def axis_of(a: Mapping[str, Array]) -> Axis:
     """Axes whose parameters are those of `ABSENT`."""
     weight, hang = wave_of(a["gravity_sin"], a["gravity_cos"])
     wave, phase = wave_of(a["cogging_sin"], a["cogging_cos"])
-    load = load_inertia(a)
+    # Inertia behind a joint: that of the load, or where it is not known all of the axis'.
+    load = np.where(a["load"] > 0, a["load"], a["inertia"])
     hung = (a["flexibility"] > 0) & (load > 0)
     stiffness = np.where(hung, load, 0.0) / np.maximum(a["flexibility"], TINY)
-    other = {"order": "cogging_order", "at_motor": "encoder_at_motor"}
+    # Half of what a derivative gain does resists the speed, within the limit of the motor.
+    damping = a["gain"] * a["derivative"]
     return Axis(
-        **{n: a[other.get(n, n)] for n in Axis._fields[:13]},
+        gain=a["gain"],
+        integral=a["integral"],
+        viscous=a["viscous"] + damping,
+        drive_damping=a["drive_damping"] + damping,
+        coulomb=a["coulomb"],
+        load_friction=a["load_friction"],
+        stribeck=a["stribeck"],
+        stribeck_speed=a["stribeck_speed"],
+        thermal=a["thermal"],
+        supply=a["supply"],
+        order=a["cogging_order"],
+        flexibility=a["flexibility"],
+        at_motor=a["encoder_at_motor"],
         weight=weight,
         hang=hang,
         wave=wave,
@@ -216,27 +214,38 @@ def axis_of(a: Mapping[str, Array]) -> Axis:
         stiffness=stiffness,
         slack=np.where(hung, 1 / np.maximum(stiffness, TINY), 0.0),
         drag=2 * a["flexible_damping"] * np.sqrt(np.maximum(a["flexibility"], 0)),
+        whole=a["inertia"],
+        delay=a["delay"],
+        slowness=a["slowness"],
+        derivative=a["derivative"],
+        damping=damping,
+        play=a["play"],
+        play_loaded=a["play_loaded"],
+        play_friction=a["play_friction"],
+        light=np.where(load > 0, 1 / np.maximum(load, TINY), 0.0),
     )
 
 
-def _each_has(axis: Axis) -> Has:
-    """What each of the axes has, arrays as they are."""
+def each_has(axis: Axis) -> Has:
+    """What each of the axes has."""
     dry = (axis.coulomb != 0) | (axis.load_friction != 0) | (axis.stribeck != 0)
     return Has(
         *(axis.integral != 0, dry, axis.load_friction != 0, axis.stribeck != 0, axis.weight != 0, axis.wave != 0),
-        *(axis.flexibility > 0, axis.limit < 1 / TINY),
+        *(axis.flexibility > 0, axis.limit < 1 / TINY, axis.slowness > 0, axis.derivative != 0, axis.play > 0),
+        (axis.play > 0) & (axis.play_loaded > 0),
     )
 
 
-def begun(axis: Axis, a: Mapping[str, Array], q: Array, v: Array, faster: Array, u: Array, push: Array) -> State:
+@compilable
+def begun(axis: Axis, q: Array, v: Array, faster: Array, u: Array, push: Array) -> State:
     """The state of axes whose encoders show `q`, `v` and their acceleration: a spring carries the load's weight, and
     the integral action what the command `u` does not."""
     pull = axis.weight * np.sin(q + axis.hang) + push
     sag = axis.slack * pull
-    behind = axis.at_motor == 0
-    load = pull + a["inertia"] * faster + axis.viscous * v + axis.coulomb * np.sign(v)
-    held = np.where(axis.integral > 0, load - axis.gain * (u - q), 0.0)
-    return State(np.where(behind, q + sag, q), v, np.where(behind, q, q - sag), v, held)
+    load = pull + axis.whole * faster + axis.viscous * v + axis.coulomb * np.sign(v)
+    held = pick(axis.integral > 0, load - axis.gain * (u - q), 0.0 * q)
+    at_motor = axis.at_motor > 0
+    return State(pick(at_motor, q, q + sag), v, pick(at_motor, q - sag, q), v, held)
 
 
 @compilable
@@ -350,67 +359,3 @@ def _solved(
 def wave_of(sine: Array, cosine: Array) -> tuple[Array, Array]:
     """Size and phase of a sine and a cosine."""
     return np.hypot(sine, cosine), np.arctan2(cosine, sine)
-
-
-def load_inertia(a: Mapping[str, Array]) -> Array:
-    """Inertia behind a joint: that of the load, or where it is not known all of the axis'."""
-    return np.where(a["load"] > 0, a["load"], a["inertia"])
-
-
-def plainly(axis: Axis, state: State, course: Course, parts: NDArray[np.int64]) -> Array:
-    """Positions of axes from sample to sample, all at once, in numpy.
-
-    Args:
-        axis, state: of `c` axes.
-        course: what they are given.
-        parts: into how many every step of an axis is divided, `c`.
-
-    Returns:
-        What the encoders show, `s x c`.
-    """
-    found = np.empty_like(course.command)
-    for many in np.unique(parts):
-        here = parts == many
-        own, now = Axis(*(v[here] for v in axis)), State(*(v[here] for v in state))
-        given, has = Course(*(v[:, here] for v in course)), Has(*(bool(v.any()) for v in _each_has(own)))
-        rows = [_shown(own, now)]
-        for k in range(len(given.step)):
-            now = advanced(own, has, now, sample_of(given, k), int(many))
-            rows.append(_shown(own, now) if has.soft else now.q)
-        found[:, here] = rows
-    return found
-
-
-def compiled(axis: Axis, state: State, course: Course, parts: NDArray[np.int64]) -> Array:
-    """As `plainly`, compiled, one axis after the other."""
-    found = np.empty_like(course.command)
-    found[0] = _shown(axis, state)
-    every, states, each_has = (np.stack(v, -1) for v in (axis, state, _each_has(axis)))
-    _course(every, states, each_has, course, parts, found)
-    return found
-
-
-def _shown(axis: Axis, state: State) -> Array:
-    return np.where(axis.at_motor > 0, state.q, state.x)
-
-
-_OF_AXIS, _OF_HAS, _OF_STATE = (len(kind._fields) for kind in (Axis, Has, State))
-
-
-@loop
-def _course(
-    every: Array,
-    states: Array,
-    each_has: NDArray[np.bool_],
-    course: Course,
-    parts: NDArray[np.int64],
-    found: Array,
-) -> None:
-    for j in range(len(every)):
-        axis, has = Axis(*fixed_tuple(every[j], _OF_AXIS)), Has(*fixed_tuple(each_has[j], _OF_HAS))
-        state = State(*fixed_tuple(states[j], _OF_STATE))
-        step, command, bend, push, supply, warm = course
-        given = Course(step[:, j], command[:, j], bend[:, j], push[:, j], supply[:, j], warm[:, j])
-        for k in range(len(step)):
-            state = advanced(axis, has, state, sample_of(given, k), parts[j])
-            found[k + 1, j] = state.q if axis.at_motor > 0 or not has.soft else state.x

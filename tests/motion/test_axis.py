@@ -15,7 +15,6 @@ from ccnn_torch.motion.effects import EFFECTS, Facts, motion_effects
 from ccnn_torch.motion.library import library_of
 from ccnn_torch.motion.search import with_gain
 from ccnn_torch.motion.spec import Spec
-from ccnn_torch.motion.stage import compiled, plainly
 
 
 def axis(time: np.ndarray, asked: np.ndarray, **parameters: float) -> np.ndarray:
@@ -206,7 +205,7 @@ def test_compiled_or_not_an_axis_moves_the_same() -> None:
     sizes = torch.rand(len(names), sets, 1, generator=generator, dtype=torch.float64)
     many = {"cogging_order": 20.0, "gain": 2.0, "stribeck_speed": 0.5, "weakness": 8.0, "integral": 4.0}
     values = {n: torch.where(h, many.get(n, 0.05) * v, ABSENT[n]) for n, h, v in zip(names, has, sizes, strict=True)}
-    ways = [simulate_axes(drive, values, move) for move in (plainly, compiled)]
+    ways = [simulate_axes(drive, values, fast) for fast in (False, True)]
     assert ways[0].std() > 0.1
     torch.testing.assert_close(*ways, rtol=0, atol=1e-10)
 
