@@ -80,7 +80,7 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor], fast: bool | N
 
     Args:
         drive: of `b` runs.
-        parameters: any of `ABSENT` by name, each broadcastable to `p x b`.
+        parameters: any of `ABSENT` by name, each broadcastable to `p x b`; others are nothing to an axis.
         fast: one axis after the other, compiled by numba, or all at once in numpy; None = what is installed.
 
     Returns:
@@ -90,8 +90,8 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor], fast: bool | N
     # Every entry has the same first dimension then, also where a single value stands for all.
     p = max([1, *(len(v) for v in parameters.values())])
     a = {n: np.full((p, b), v) for n, v in ABSENT.items()}
-    for name, value in parameters.items():
-        a[name][:] = value.numpy()
+    for name in a.keys() & parameters.keys():
+        a[name][:] = parameters[name].numpy()
     axis, offset = Axis(*(v.ravel() for v in axis_of(a))), a["offset"].ravel()
     # The fastest motion of an axis is that of its mass on the gain: each has steps of its own, whatever is beside it.
     masses = axis.whole / np.maximum(axis.gain, TINY)
