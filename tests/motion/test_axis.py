@@ -213,6 +213,10 @@ def test_compiled_or_not_an_axis_moves_the_same() -> None:
 def test_the_last_digit_of_a_command_decides_nothing() -> None:
     sets = [{"cogging_sin": 0.04, "cogging_order": 84.0}, {"stribeck": 0.05, "stribeck_speed": 0.02, "viscous": 0.01}]
     sets += [{"stribeck": 0.1, "coulomb": 0.05, "load_friction": 0.3}, OWN | {"stribeck": 0.1, "stribeck_speed": 0.01}]
+    sets += [
+        {"stribeck": 0.013, "stribeck_speed": 1.85},
+        {"cogging_sin": 0.1, "cogging_cos": 0.1, "cogging_order": 60.0},
+    ]
     sets += [{"inertia": 1e-6, "cogging_sin": 0.03, "cogging_order": 150.0, "coulomb": 0.01}]
     asked = command(1, TIME)
     rounded = asked * (1 + 2.3e-16 * np.random.default_rng(1).choice([-1, 0, 1], len(asked)))
