@@ -23,8 +23,6 @@ PACKAGE = ROOT / "ccnn_torch"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*/*.md"))]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 CONSTANTS = ROOT / "docs" / "explanation" / "diagnosis_constants.md"
-# Where sets of causes of a motion are fitted, searched and judged.
-OF_MOTION = ("fit", "held_out", "judge", "linearised", "search", "whiten")
 
 
 def numeric_constants(path: Path) -> Iterator[tuple[str, str]]:
@@ -47,7 +45,7 @@ def test_every_constant_of_the_diagnosis_is_in_the_table_with_its_value() -> Non
     table = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \| `([^`]+)` \| .+ \| .+ \|$", CONSTANTS.read_text(), re.M)
     code = {
         (path.relative_to(PACKAGE).with_suffix("").as_posix(), names, value)
-        for pattern in ("evidence/*.py", "diagnosis/**/*.py", *(f"motion/{name}.py" for name in OF_MOTION))
+        for pattern in ("evidence/*.py", "diagnosis/**/*.py", "motion/*.py")
         for path in PACKAGE.glob(pattern)
         if "page" not in path.parts
         for names, value in numeric_constants(path)

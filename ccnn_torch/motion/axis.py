@@ -22,7 +22,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.motion.stage import ABSENT, GAMMA, TINY, Rule, load_inertia, wave_of
+from ccnn_torch.motion.compilable import is_compiled
+from ccnn_torch.motion.course import compiled, course
+from ccnn_torch.motion.stage import ABSENT, TINY, Axis, Has, axis_of, each_has
 
 Array = NDArray[np.float64]
 # Steps longer than this, in units of the axis' own time constant, are divided.
@@ -73,190 +75,52 @@ def delayed(time: Tensor, values: Tensor, delay: Tensor) -> Tensor:
     return (x0 + (x1 - x0) * share).reshape(b, p, s).transpose(0, 1)
 
 
-def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
+def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor], fast: bool | None = None) -> Tensor:
     """Positions of axes.
 
     Args:
         drive: of `b` runs.
-        parameters: any of `ABSENT` by name, each broadcastable to `p x b`.
+        parameters: any of `ABSENT` by name, each broadcastable to `p x b`; others are nothing to an axis.
+        fast: one axis after the other, compiled by numba, or all at once in numpy; None = what is installed.
 
     Returns:
         `p x b x s` [rad or m]; the first dimension is 1 where all parameters' are.
     """
-    like = drive.command
+    b, s = drive.command.shape
     # Every entry has the same first dimension then, also where a single value stands for all.
-    shape = torch.Size([max([1, *(len(v) for v in parameters.values())]), len(like)])
-    tensors = {n: parameters.get(n, like.new_full((1, 1), v)).expand(shape) for n, v in ABSENT.items()}
-    u, torque = drive.command, drive.torque
-    if bool((tensors["delay"] != 0).any()):
-        u = torch.where(tensors["delay"][..., None] != 0, delayed(drive.time, u, tensors["delay"]), u)
-    u = u.expand(*shape, -1) + tensors["offset"][..., None]
-    a = {n: v.numpy() for n, v in tensors.items()}
-    steps = drive.time.diff(dim=-1).numpy().T
-    # Samples first: one sample of all runs lies together in memory.
-    commands = np.ascontiguousarray(u.permute(2, 0, 1).numpy())
-    push = None if torque is None else np.ascontiguousarray(torque.expand(*shape, -1).permute(2, 0, 1).numpy())
-    if np.any(a["slowness"] > 0):
-        slow = a["slowness"] > 0
-        limited = _limited(steps, commands, 1 / np.maximum(a["slowness"], TINY), _held_at(drive, push, a))
-        commands = np.where(slow, limited, commands)
-    if np.any(a["derivative"]):
-        commands = commands + _lead(steps, commands, a["derivative"], a["integral"])
-        # The other half of it resists the speed, within the limit of the motor.
-        damping = a["gain"] * a["derivative"]
-        a |= {n: a[n] + damping for n in ("viscous", "drive_damping")}
-    moved = _moved(drive, steps, commands, push, a)
-    if np.any(a["play"] > 0):
-        loaded = a["play_loaded"] > 0
-        driven = played(moved, a["play"] / 2)
-        if np.any(loaded):
-            driven = np.where(loaded, hung(steps, moved, push, a), driven)
-        moved = driven
-    return torch.from_numpy(moved).permute(1, 2, 0)
-
-
-def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[str, Array]) -> Array:
-    """What the encoder shows but for a play, `s x p x b`."""
+    p = max([1, *(len(v) for v in parameters.values())])
+    a = {n: np.full((p, b), v) for n, v in ABSENT.items()}
+    for name in a.keys() & parameters.keys():
+        a[name][:] = parameters[name].numpy()
+    axis, offset = Axis(*(v.ravel() for v in axis_of(a))), a["offset"].ravel()
     # The fastest motion of an axis is that of its mass on the gain: each has steps of its own, whatever is beside it.
-    masses = a["inertia"] / np.maximum(a["gain"], TINY)
-    fast = np.sqrt(np.where(masses > 0, masses, math.inf))
-    many = np.clip(np.ceil(np.median(steps, 0) / np.maximum(fast, TINY) / _LONGEST), 1, _MOST_PARTS)
-    found = np.empty_like(u)
-    for parts in np.unique(many):
-        here = many == parts
-        if here.all():
-            return _divided(drive, steps, u, push, a, int(parts))
-        runs = np.nonzero(here)[1]
-        own = Drive._make(None if v is None else v[runs] for v in drive)
-        some = None if push is None else push[:, here]
-        values = {name: value[here] for name, value in a.items()}
-        found[:, here] = _divided(own, steps[:, runs], u[:, here], some, values, int(parts))
-    return found
-
-
-def _divided(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[str, Array], parts: int) -> Array:
-    """The same of axes all of whose steps are divided into so many parts; `...` is `p x b`, or what was chosen of it.
-
-    Args:
-        drive: of the runs of the last dimension.
-        steps: of time, `(s - 1) x b`.
-        u, push: `s x ...`.
-        a: parameters, `...`.
-        parts: of a step.
-    """
-    start = drive.start.numpy()
-    q, v = (np.broadcast_to(start[:, k], u.shape[1:]) for k in range(2))
-    faster = start[:, 2] if start.shape[1] > 2 else np.zeros(len(start))
-    rule = Rule(a)
-    state = rule.begun(q, v, faster, u[0], None if push is None else push[0])
-    share = None
-    if np.any(a["supply"]) and drive.supply is not None and bool((drive.supply != 0).any()):
-        share = [np.maximum(1 + a["supply"] * supply, 0) for supply in drive.supply.numpy().T]
-    warm = drive.warm.numpy().T if np.any(a["thermal"]) and drive.warm is not None else None
-    bend = None if drive.bent is None else _bend(u) * drive.bent.numpy()
-    found = np.empty_like(u)
-    found[0] = q
-    ahead = (1 - GAMMA) / GAMMA
-    for k in range(len(steps)):
-        h = steps[k] * (GAMMA / parts)
-        dry = a["coulomb"] if warm is None else a["coulomb"] * np.maximum(1 + a["thermal"] * warm[k], 0)
-        fixed = rule.fixed(h, None if share is None else share[k + 1], dry)
-        slope = (u[k + 1] - u[k]) / parts
-        for i in range(parts):
-            before = u[k] + i * slope
-            ends = [(i + c) / parts for c in (GAMMA, 1.0)]
-            against = [None if push is None else _between(push, k, end) for end in ends]
-            asked = [before + c * slope for c in (GAMMA, 1.0)]
-            if bend is not None:
-                asked = [one + end * (1 - end) * bend[k] for one, end in zip(asked, ends, strict=True)]
-            middle = rule.step(state, asked[0], fixed, against[0])
-            between = tuple(one + ahead * (other - one) for one, other in zip(state, middle, strict=True))
-            state = rule.step(between, asked[1], fixed, against[1])
-        found[k + 1] = rule.read(state)
-    return found
-
-
-def _bend(u: Array) -> Array:
-    """Of each step four times what a parabola through the samples is above the middle of a straight line; 0 at a jump
-    or corner, `(s - 1) x p x b`."""
-    second = np.diff(u, 2, axis=0)
-    second = np.concatenate([second[:1], second, second[-1:]]) if len(second) else np.zeros_like(u)
-    a, b = second[:-1], second[1:]
-    return np.asarray(-0.5 * np.where(a * b > 0, np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0.0))
-
-
-def _between(values: Array, k: int, share: float) -> Array:
-    return np.asarray(values[k] + share * (values[k + 1] - values[k]))
-
-
-def _held_at(drive: Drive, push: Array | None, a: Mapping[str, Array]) -> Array:
-    """The command, `p x b`, at which an axis moves as it does at its start, but for its friction and inertia."""
-    q, v = drive.start[:, 0].numpy(), drive.start[:, 1].numpy()
-    weight, hang = wave_of(a["gravity_sin"], a["gravity_cos"])
-    load = weight * np.sin(q + hang) + a["viscous"] * v + (0.0 if push is None else push[0])
-    return np.asarray(q + load / np.maximum(a["gain"], TINY))
-
-
-def _limited(steps: Array, u: Array, fastest: Array, begin: Array) -> Array:
-    """Commands that change no faster than [rad/s], and may be behind already where they begin, `p x b`."""
-    found = u.copy()
-    found[0] = begin
-    for k in range(len(steps)):
-        reach = fastest * steps[k]
-        found[k + 1] = found[k] + np.minimum(np.maximum(u[k + 1] - found[k], -reach), reach)
-    return found
-
-
-def _lead(steps: Array, u: Array, derivative: Array, integral: Array) -> Array:
-    """What a derivative gain adds to commands, `s x p x b`; less what the integral action would make of that, which
-    integrates the commands alone."""
-    step, rise = steps[:, None], np.diff(u, axis=0)
-    inner = (rise[1:] + rise[:-1]) / (step[1:] + step[:-1])
-    found: Array = derivative * np.concatenate([rise[:1] / step[:1], inner, rise[-1:] / step[-1:]])
-    if np.any(integral):
-        change = np.diff(found, axis=0)
-        for k in range(len(steps)):
-            fades = 0.5 * integral * steps[k]
-            found[k + 1] = (found[k] * (1 - fades) + change[k]) / (1 + fades)
-    return found
-
-
-def played(q: Array, half: Array) -> Array:
-    """The driven side of a play, which rests in the middle at first."""
-    found = q.copy()
-    for k in range(1, len(q)):
-        found[k] = np.maximum(np.minimum(found[k - 1], q[k] + half), q[k] - half)
-    return found
-
-
-def hung(steps: Array, q: Array, push: Array | None, a: Mapping[str, Array]) -> Array:
-    """The driven side of a play, which is free between its ends but for its friction, and does not bounce there."""
-    fall, hang = _falling(a)
-    inertia, half = load_inertia(a), a["play"] / 2
-    light = np.where(inertia > 0, 1 / np.maximum(inertia, TINY), 0.0)
-    found = q.copy()
-
-    def pulled(x: Array, k: int) -> Array:
-        return np.asarray(fall * np.sin(x + hang) + (0.0 if push is None else push[k] * light))
-
-    x, v = q[0] - half * np.sign(pulled(q[0], 0)), np.zeros_like(q[0])
-    found[0] = x
-    for k in range(len(steps)):
-        h = steps[k]
-        v = v - h * pulled(x, k)
-        # Its bearing brakes it, up to standstill.
-        v = np.sign(v) * np.maximum(np.abs(v) - h * a["play_friction"], 0.0)
-        free = x + h * v
-        low, high = q[k + 1] - half, q[k + 1] + half
-        held = np.minimum(np.maximum(free, low), high)
-        v = np.where(held == free, v, (q[k + 1] - q[k]) / h)
-        x = held
-        found[k + 1] = x
-    return found
-
-
-def _falling(a: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Size and phase of the acceleration by which the weight turns the far side of a joint back [rad/s^2]."""
-    weight, hang = wave_of(a["gravity_sin"], a["gravity_cos"])
-    inertia = load_inertia(a)
-    return np.where(inertia > 0, weight / np.maximum(inertia, TINY), 0.0), hang
+    masses = axis.whole / np.maximum(axis.gain, TINY)
+    fast_ones = np.sqrt(np.where(masses > 0, masses, math.inf))
+    usual = np.tile(np.median(drive.time.diff(dim=-1).numpy(), -1), p)
+    parts = np.clip(np.ceil(usual / np.maximum(fast_ones, TINY) / _LONGEST), 1, _MOST_PARTS).astype(np.int64)
+    start = np.zeros((b, 3))
+    start[:, : drive.start.shape[1]] = drive.start.numpy()
+    bent = np.zeros(b) if drive.bent is None else drive.bent.numpy()
+    there = (True, bool(axis.supply.any()), bool(axis.thermal.any()))
+    beside = [
+        np.ascontiguousarray(one.expand(b, -1).numpy()) if has and one is not None else np.zeros((b, 1))
+        for one, has in zip((drive.torque, drive.supply, drive.warm), there, strict=True)
+    ]
+    push, supply, warm = beside
+    if is_compiled() if fast is None else fast:
+        time, command = (np.ascontiguousarray(one.expand(b, -1).numpy()) for one in (drive.time, drive.command))
+        together = compiled(axis, offset, time, command, start, bent, push, supply, warm, parts)
+        return torch.from_numpy(together).reshape(p, b, s)
+    delay, late = torch.from_numpy(a["delay"]), drive.command.expand(p, -1, -1)
+    if bool((delay != 0).any()):
+        late = torch.where(delay[..., None] != 0, delayed(drive.time, drive.command, delay), late)
+    u = (late.reshape(p * b, s) + torch.from_numpy(offset)[:, None]).numpy()
+    step, run = drive.time.diff(dim=-1).numpy(), np.tile(np.arange(b), p)
+    found = np.empty((p * b, s))
+    for many in np.unique(parts):
+        here = np.flatnonzero(parts == many)
+        own = Axis(*(v[here] for v in axis))
+        has = Has(*(bool(v.any()) for v in each_has(own)))
+        one, begin, bend, resists, volts, heat = (v[run[here]].T for v in (step, start, bent, push, supply, warm))
+        found[here] = course(own, has, one, u[here].T.copy(), begin, bend, resists, volts, heat, int(many)).T
+    return torch.from_numpy(found).reshape(p, b, s)

@@ -151,7 +151,8 @@ def _diagnosed(
         **_where_is(problem, nothing, drawn),
         effects=every,
         in_order=order_block(names, in_steps),
-        verdict=verdict_block(names, math.prod(v.probability for v in verdicts), total, bool(drivers), drivers),
+        verdict=verdict_block(names, min(v.probability for v in verdicts), total, bool(drivers), drivers),
+        joints=_joints_of(problem, verdicts, nothing, residuals[len(names)]),
         next_measurements=wanted,
         not_seen={n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
         cautions=[*cautions, *_hidden_of(problem, verdicts)],
@@ -220,6 +221,26 @@ def _effects_of(
         probability = 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts)
         rows.append(effect_block(name, probability, parameters, own, like, {}))
     return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
+
+
+def _joints_of(
+    problem: Problem, verdicts: Sequence[AxisVerdict], before: Tensor, after: Tensor
+) -> list[dict[str, Any]]:
+    """`joints`, the verdict on each; before, after: residuals held out."""
+    names, judged = problem.library.names, problem.data.judged
+    sizes = [left[:, judged].square().mean(-1).sqrt().tolist() for left in (before, after)]
+    return [
+        {
+            "joint": f"q{i + 1}",
+            "effects": [names[m] for m in v.best.members],
+            "classes": {names[m]: [names[o] for o in v.classes.get(m, ())] for m in v.best.members},
+            "probability": v.probability,
+            "driver": v.driver,
+            "gap_before": first,
+            "gap_after": last,
+        }
+        for i, (v, first, last) in enumerate(zip(verdicts, *sizes, strict=True))
+    ]
 
 
 def _hidden_of(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:

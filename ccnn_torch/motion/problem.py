@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -61,6 +62,25 @@ class Problem:
     def axes(self) -> Tensor:
         """The number of each axis, `n`."""
         return torch.arange(len(self.followed))
+
+    def of(self, rows: Tensor) -> Problem:
+        """The same of some stretches."""
+
+        def some(values: Tensor | None, dim: int = 1) -> Any:
+            return None if values is None else values.index_select(dim, rows)
+
+        data = self.data
+        return replace(
+            self,
+            data=data._replace(
+                **{n: some(getattr(data, n)) for n in ("command", "position", "speed")},
+                **{n: some(getattr(data, n), 0) for n in ("time", "judged", "run", "log", "bent")},
+                beside={name: some(v, 0) for name, v in data.beside.items()},
+            ),
+            **{n: some(getattr(self, n)) for n in ("followed", "torque", "simulated", "there", "carried")},
+            **{n: some(getattr(self, n), 0) for n in ("supply", "warm")},
+            own={name: some(v) for name, v in self.own.items()},
+        )
 
     @cached_property
     def _start(self) -> Tensor:

@@ -23,8 +23,12 @@ from ccnn_torch.motion.whiten import Whitening, fitted_whitening, white_noise
 
 # Sets that are extended, effects that are fitted for each of them after the screen, and members at most.
 _BEAM, _FITTED, _MOST = 2, 4, 9
+# Decimals of a log evidence up to which sets do the same.
+_DIGITS = 3
 # Log posterior that a level must bring.
 _GAINED = 1.0
+# Stretches in which sets are looked for.
+_SCREENED = 16
 # Sets that are fitted anew under another noise.
 _KEPT = 6
 _LONG, _SHORT, _FEW = 8, 5, 3
@@ -60,11 +64,13 @@ def log_posterior(fit: Fit) -> float:
 
 def search(problem: Problem) -> Search:
     """Find the probable sets of every axis."""
-    n = len(problem.followed)
-    plain = _Pool(problem, white_noise(n))
+    n, count = len(problem.followed), len(problem.data.run)
+    # Sets are looked for in some of the stretches, and fitted to all.
+    few = problem.of(torch.linspace(0, count - 1, _SCREENED).round().long()) if count > _SCREENED else problem
+    plain = _Pool(few, white_noise(n))
     plain.forward()
     largest = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
-    pool = _Pool(problem, fitted_whitening(problem.pooled(largest), problem.judged))
+    pool = _Pool(few, fitted_whitening(problem.pooled(largest), problem.judged))
     pool.again(plain)
     pool.forward()
     # The noise of what is left by what is most probable now.
@@ -93,6 +99,11 @@ def search(problem: Problem) -> Search:
     )
 
 
+def _level(score: float) -> float:
+    """A log evidence so that those of sets that do the same are equal, whatever the last digit is."""
+    return round(score, _DIGITS) if math.isfinite(score) else score
+
+
 class _Pool:
     """Fits of each axis by their members, under one noise."""
 
@@ -115,7 +126,17 @@ class _Pool:
         return [self.ranked()[i][0] for i in range(self.axes)]
 
     def ranked(self) -> list[list[Fit]]:
-        return [sorted(own.values(), key=lambda f: -self.score(i, f)) for i, own in enumerate(self.found)]
+        return [
+            sorted(own.values(), key=lambda f: (-_level(self.score(i, f)), f.members))
+            for i, own in enumerate(self.found)
+        ]
+
+    def leading(self, axis: int) -> list[Fit]:
+        """The most probable sets of an axis; of those that do the same one."""
+        apart: dict[float, Fit] = {}
+        for fit in self.ranked()[axis]:
+            apart.setdefault(_level(self.score(axis, fit)), fit)
+        return list(apart.values())[:_BEAM]
 
     def noise_of(self, axis: int) -> float | None:
         return None if self.variance is None else self.variance[axis]
@@ -154,8 +175,8 @@ class _Pool:
         for _ in range(_MOST):
             before = [self.score(i, f) for i, f in enumerate(self.best())]
             bases = [
-                [f for f in ranked[:_BEAM] if gains[i] and f.members not in done[i] and len(f.members) < _MOST]
-                for i, ranked in enumerate(self.ranked())
+                [f for f in self.leading(i) if gains[i] and f.members not in done[i] and len(f.members) < _MOST]
+                for i in range(self.axes)
             ]
             for d, own in zip(done, bases, strict=True):
                 d |= {f.members for f in own}
@@ -163,7 +184,7 @@ class _Pool:
             alone = all(not f.members for own in bases for f in own)
             self.fit(self.screened(bases, len(self.library.names) if alone else _FITTED), _SHORT)
             self.fit(
-                [[f.spec for f in r[:_BEAM] if f.members and own] for r, own in zip(self.ranked(), bases, strict=True)],
+                [[f.spec for f in self.leading(i) if f.members and own] for i, own in enumerate(bases)],
                 _SHORT,
             )
             after = [self.score(i, f) for i, f in enumerate(self.best())]
@@ -210,9 +231,9 @@ class _Pool:
         for i, fit in [(i, fit) for i, own in enumerate(bases) for fit in own]:
             scores: dict[int, tuple[float, Variant]] = {}
             for score, variant in promise(self.problem, self.whitening, i, fit, self.nuisance[i], self.noise_of(i)):
-                if variant.effect not in scores or score > scores[variant.effect][0]:
+                if variant.effect not in scores or _level(score) > _level(scores[variant.effect][0]):
                     scores[variant.effect] = (score, variant)
-            ranked = (variant for _, variant in sorted(scores.values(), key=lambda item: -item[0]))
+            ranked = (v for _, v in sorted(scores.values(), key=lambda item: (-_level(item[0]), item[1].effect)))
             specs = (started(self.library, fit.spec, variant, i) for variant in ranked)
             new = (spec for spec in specs if spec.members not in self.found[i])
             for spec in islice(new, most):

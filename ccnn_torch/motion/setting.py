@@ -29,6 +29,8 @@ _POOLED = 0.02
 _HIGHEST, _RIPPLES = 200.0, 4
 # Median sizes at which what is left of the torque is clipped.
 _CLIPPED = 3.0
+# Share of the mean speed at which a direction is settled.
+_SOFT = 0.1
 # Quantile of what counts as nearly the largest.
 _NEARLY = 0.98
 
@@ -106,7 +108,11 @@ def _ripples(
     torque = nominal.get("inertia", 0.0) * a + nominal.get("viscous", 0.0) * v - motor
     span = float(q.max() - q.min()) or 1.0
     x = (q - q.mean()) / span
-    smooth = torch.stack([torch.ones_like(x), *(x**k for k in range(1, 6)), u, w, w.sign(), f], -1)
+    # A command at rest has no direction, whatever its last digit is.
+    direction = torch.tanh(w / (_SOFT * w.abs().mean()).clamp_min(1e-12))
+    # Of a model without inertia and friction command and position are all of the torque.
+    gain = [u] if nominal.get("inertia") or nominal.get("viscous") else []
+    smooth = torch.stack([torch.ones_like(x), *(x**k for k in range(1, 6)), *gain, w, direction, f], -1)
     scale = smooth.square().mean(0).sqrt().clamp_min(1e-300)
     smooth = smooth / scale
     left = torque - smooth @ torch.linalg.lstsq(smooth, torque[:, None], driver="gelsd").solution[:, 0]

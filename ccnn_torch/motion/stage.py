@@ -1,18 +1,22 @@
-"""One implicit stage of an axis, for many axes at once.
+"""One implicit stage of an axis.
 
-The rule is SDIRK2 (Alexander 1977), whose two implicit stages are solved in closed form, dry friction included, so that
-an axis without mass, or one that sticks, needs no smaller steps. The far side of a flexible joint is linear in the
-motor's speed at the end of a stage but for its weight, which is taken at the stage's begin, and so is solved with it.
+A stage takes numbers, or arrays of many axes: from sample to sample go all axes at once in numpy, or one after the
+other where numba is installed. The rule is SDIRK2 (Alexander 1977), whose two implicit stages are solved in closed
+form, dry friction included, so that an axis without mass, or one that sticks, needs no smaller steps. The far side of
+a flexible joint is linear in the motor's speed at the end of a stage but for its weight, which is taken at the stage's
+begin, and so is solved with it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ccnn_torch.motion.compilable import compilable, pick
 
 ABSENT: dict[str, float] = {
     "gain": 1.0,
@@ -50,15 +54,89 @@ Array = NDArray[np.float64]
 GAMMA = 1 - 1 / math.sqrt(2)
 TINY = 1e-9
 # How steep a wave is followed: shares of what gain and friction, and inertia, resist a motion with within a stage.
-_STEEP, _SWINGING = 0.5, 0.05
+_STEEP, _SWINGING = 0.4, 0.05
 # Largest slope of exp(-x^2).
 _STEEPEST = math.sqrt(2 / math.e)
 # rad/s or m/s: no axis is faster, and no number may overflow.
 _FASTEST = 1e4
+# From the middle stage to where the last one begins.
+_AHEAD = (1 - GAMMA) / GAMMA
 
 
-State = tuple[Array, ...]
-"""Position and speed of the motor, of the load where it hangs on a spring; last the torque of the integral action."""
+class Axis(NamedTuple):
+    """Parameters of axes, as in `ABSENT`, and what follows from them.
+
+    Attributes:
+        weight, hang, wave, phase: sizes and phases of the weight and the cogging: a sine and a cosine of one angle are
+            one sine, which is what costs time here.
+        limit: of the motor's torque.
+        inertia: of the motor's side where a load hangs on a spring.
+        hung: 1 where it does: a load of no inertia does not pull at the motor, and its weight stays there.
+        stiffness, slack, drag: of that spring, one over it, and its damping over it.
+        whole: inertia of motor and load.
+        damping: part of `viscous` and `drive_damping` that the derivative gain makes.
+        light: one over the inertia behind a play.
+    """
+
+    gain: Array
+    integral: Array
+    viscous: Array
+    drive_damping: Array
+    coulomb: Array
+    load_friction: Array
+    stribeck: Array
+    stribeck_speed: Array
+    thermal: Array
+    supply: Array
+    order: Array
+    flexibility: Array
+    at_motor: Array
+    weight: Array
+    hang: Array
+    wave: Array
+    phase: Array
+    limit: Array
+    inertia: Array
+    hung: Array
+    stiffness: Array
+    slack: Array
+    drag: Array
+    whole: Array
+    delay: Array
+    slowness: Array
+    derivative: Array
+    damping: Array
+    play: Array
+    play_loaded: Array
+    play_friction: Array
+    light: Array
+
+
+class Has(NamedTuple):
+    """What axes have, true or false, or arrays of it; what none has is left out, which changes nothing."""
+
+    integral: Any
+    dry: Any
+    load_friction: Any
+    stribeck: Any
+    heavy: Any
+    waves: Any
+    soft: Any
+    weak: Any
+    slow: Any
+    led: Any
+    play: Any
+    hung: Any
+
+
+class State(NamedTuple):
+    """Position and speed of the motor, and of the load where it hangs on a spring; torque of the integral action."""
+
+    q: Array
+    v: Array
+    x: Array
+    w: Array
+    held: Array
 
 
 class _Fixed(NamedTuple):
@@ -80,136 +158,204 @@ class _Fixed(NamedTuple):
     follows: Array
 
 
-class Rule:
-    """One implicit stage; what no axis has is left out of the arithmetic."""
+class Sample(NamedTuple):
+    """What axes are given from one sample to the next.
 
-    def __init__(self, a: Mapping[str, Array]) -> None:
-        self.a = a
-        self.limit = 1 / np.maximum(a["weakness"], TINY)
-        self.has = {n: bool(np.any(a[n] != ABSENT[n])) for n in ABSENT}
-        self.dry = any(self.has[n] for n in ("coulomb", "load_friction", "stribeck"))
-        self.waves = self.has["cogging_sin"] or self.has["cogging_cos"]
-        self.heavy = self.has["gravity_sin"] or self.has["gravity_cos"]
-        # A sine and a cosine of one angle are one sine, which is what costs time here.
-        self.weight, self.hang = wave_of(a["gravity_sin"], a["gravity_cos"])
-        self.wave, self.phase = wave_of(a["cogging_sin"], a["cogging_cos"])
-        self.inertia, self.soft = a["inertia"], bool(np.any(a["flexibility"] > 0))
-        if self.soft:
-            load = load_inertia(a)
-            # A load of no inertia does not pull at the motor, and its weight stays there.
-            self.hung = (a["flexibility"] > 0) & (load > 0)
-            self.stiffness = np.where(self.hung, load, 0.0) / np.maximum(a["flexibility"], TINY)
-            self.slack = np.where(self.hung, 1 / np.maximum(self.stiffness, TINY), 0.0)
-            self.drag = 2 * a["flexible_damping"] * np.sqrt(np.maximum(a["flexibility"], 0))
-            self.inertia = np.where(self.hung, np.maximum(self.inertia - load, 0.0), self.inertia)
+    Attributes:
+        step: the time between them.
+        before, after: commands.
+        bend: four times what the command is above a straight line in the middle.
+        push, pushed: what resists the motor beside its axis, at both.
+        supply: voltage over the nominal one, less 1.
+        warm: temperature less that of the coldest sample.
+    """
 
-    def begun(self, q: Array, v: Array, faster: Array, u: Array, push: Array | None) -> State:
-        """The state of an axis whose encoder shows `q`, `v` and its acceleration: a spring carries the load's weight,
-        and the integral action what the command `u` does not."""
-        state = self._hanging(q, v, push)
-        if not self.has["integral"]:
-            return state
-        friction = self.a["coulomb"] * np.sign(v)
-        load = self.pulling(q, push) + self.a["inertia"] * faster + self.a["viscous"] * v + friction
-        return *state, np.where(self.a["integral"] > 0, load - self.a["gain"] * (u - q), 0.0)
+    step: Array
+    before: Array
+    after: Array
+    bend: Array
+    push: Array
+    pushed: Array
+    supply: Array
+    warm: Array
 
-    def _hanging(self, q: Array, v: Array, push: Array | None) -> State:
-        if not self.soft:
-            return q, v
-        sag = self.slack * self.pulling(q, push)
-        behind = self.a["encoder_at_motor"] == 0
-        return np.where(behind, q + sag, q), v, np.where(behind, q, q - sag), v
 
-    def read(self, state: State) -> Array:
-        """What the encoder shows."""
-        return np.where(self.a["encoder_at_motor"] > 0, state[0], state[2]) if self.soft else state[0]
+def axis_of(a: Mapping[str, Array]) -> Axis:
+    """Axes whose parameters are those of `ABSENT`."""
+    weight, hang = wave_of(a["gravity_sin"], a["gravity_cos"])
+    wave, phase = wave_of(a["cogging_sin"], a["cogging_cos"])
+    # Inertia behind a joint: that of the load, or where it is not known all of the axis'.
+    load = np.where(a["load"] > 0, a["load"], a["inertia"])
+    hung = (a["flexibility"] > 0) & (load > 0)
+    stiffness = np.where(hung, load, 0.0) / np.maximum(a["flexibility"], TINY)
+    # Half of what a derivative gain does resists the speed, within the limit of the motor.
+    damping = a["gain"] * a["derivative"]
+    return Axis(
+        gain=a["gain"],
+        integral=a["integral"],
+        viscous=a["viscous"] + damping,
+        drive_damping=a["drive_damping"] + damping,
+        coulomb=a["coulomb"],
+        load_friction=a["load_friction"],
+        stribeck=a["stribeck"],
+        stribeck_speed=a["stribeck_speed"],
+        thermal=a["thermal"],
+        supply=a["supply"],
+        order=a["cogging_order"],
+        flexibility=a["flexibility"],
+        at_motor=a["encoder_at_motor"],
+        weight=weight,
+        hang=hang,
+        wave=wave,
+        phase=phase,
+        limit=1 / np.maximum(a["weakness"], TINY),
+        inertia=np.where(hung, np.maximum(a["inertia"] - load, 0.0), a["inertia"]),
+        hung=hung.astype(float),
+        stiffness=stiffness,
+        slack=np.where(hung, 1 / np.maximum(stiffness, TINY), 0.0),
+        drag=2 * a["flexible_damping"] * np.sqrt(np.maximum(a["flexibility"], 0)),
+        whole=a["inertia"],
+        delay=a["delay"],
+        slowness=a["slowness"],
+        derivative=a["derivative"],
+        damping=damping,
+        play=a["play"],
+        play_loaded=a["play_loaded"],
+        play_friction=a["play_friction"],
+        light=np.where(load > 0, 1 / np.maximum(load, TINY), 0.0),
+    )
 
-    def fixed(self, h: Array, share: Array | None, dry: Array) -> _Fixed:
-        """What all stages of a sample have in common; share: of the motor's strength that the supply allows."""
-        gain, limit = (self.a["gain"], self.limit) if share is None else (self.a["gain"] * share, self.limit * share)
-        mass = self.inertia / h
-        light, over, drag, follows = mass + self.a["viscous"], h, h, h
-        if self.soft:
-            over, drag = self.a["flexibility"] / h, h + self.drag
-            follows = drag / (over + drag)
-            light = light + self.stiffness * drag * (1 - follows)
-        rate = gain * self.a["integral"]
-        gain = gain + rate * h
-        return _Fixed(h, gain, rate, limit, dry, mass, np.maximum(light, TINY), gain * h, over, drag, follows)
 
-    def pulling(self, q: Array, push: Array | None) -> Array | float:
-        """Torque of the weight and of the other joints at a position."""
-        weight = self.weight * np.sin(q + self.hang) if self.heavy else 0.0
-        return weight if push is None else weight + push
+def each_has(axis: Axis) -> Has:
+    """What each of the axes has."""
+    dry = (axis.coulomb != 0) | (axis.load_friction != 0) | (axis.stribeck != 0)
+    return Has(
+        *(axis.integral != 0, dry, axis.load_friction != 0, axis.stribeck != 0, axis.weight != 0, axis.wave != 0),
+        *(axis.flexibility > 0, axis.limit < 1 / TINY, axis.slowness > 0, axis.derivative != 0, axis.play > 0),
+        (axis.play > 0) & (axis.play_loaded > 0),
+    )
 
-    def step(self, state: State, u: Array, fixed: _Fixed, push: Array | None) -> State:
-        """The state at the end of a stage."""
-        a, h, limit, q, v = self.a, fixed.h, fixed.limit, *state[:2]
-        motor = fixed.gain * (u - q)
-        if self.has["integral"]:
-            motor = motor + state[-1]
-        # What the gear carries beside the motor's torque.
-        carried = self.pulling(q, push)
-        against, loose = carried, q
-        if self.soft:
-            x, w = state[2:4]
-            apart, pulled = q - x, self.pulling(x, push)
-            # The load's speed at the end of the stage is this and `follows` times the motor's.
-            loose = (fixed.over * w + apart - self.slack * pulled) / (fixed.over + fixed.drag)
-            carried = np.where(self.hung, pulled, carried)
-            against = np.where(self.hung, self.stiffness * (apart - fixed.drag * loose), against)
-        free = fixed.mass * v - against
-        light = fixed.light
-        if self.waves:
-            # Linearised, and no steeper than a stage can follow: else the last digit would decide where it goes.
-            order, steepest = a["cogging_order"], _STEEP * (light - fixed.mass + fixed.stiff) + _SWINGING * fixed.mass
-            wave = np.minimum(self.wave * order, steepest / h)
-            free = free - wave / order * np.sin(order * q + self.phase)
-            light = light + h * wave * np.cos(order * q + self.phase)
-        friction = fixed.dry
-        if self.has["stribeck"]:
-            # So does it fall with the speed.
-            least = _STEEPEST * a["stribeck"] / (light + fixed.stiff)
-            friction = friction + a["stribeck"] * np.exp(-np.square(v / np.maximum(a["stribeck_speed"], least)))
-        speed = self.solved(free, motor, friction, carried, light, fixed.stiff)
-        if self.has["weakness"]:
-            # The part of the damping that the drive makes is within its limit.
-            torque = motor - (fixed.stiff + a["drive_damping"]) * speed
-            held = np.minimum(np.maximum(torque, -limit), limit)
-            if not np.array_equal(held, torque):
-                lighter = np.maximum(light - a["drive_damping"], TINY)
-                weak = self.solved(free, held, friction, carried, lighter, 0 * held)
-                speed = np.where(torque == held, speed, weak)
-        speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)
-        ended: State = q + h * speed, speed
-        if self.soft:
-            far = np.minimum(np.maximum(loose + fixed.follows * speed, -_FASTEST), _FASTEST)
-            ended = *ended, state[2] + h * far, far
-        if self.has["integral"]:
-            # Beyond the limit of the motor it stands still (anti-windup).
-            grown = state[-1] + fixed.rate * h * (u - ended[0])
-            ended = *ended, np.minimum(np.maximum(grown, -limit), limit)
-        return ended
 
-    def solved(
-        self, free: Array, motor: Array, friction: Array, carried: Array | float, light: Array, stiff: Array
-    ) -> Array:
-        """Speed under all torques against dry friction; stiff: how fast the motor's falls with it."""
-        resistance, push = light + stiff, free + motor
-        if self.has["load_friction"]:
-            share, load = self.a["load_friction"], motor + carried
-            friction = friction + share * np.abs(load)
-            resistance = resistance - share * stiff * np.sign(push * load)
-        if self.dry:
-            push = push - np.minimum(np.maximum(push, -friction), friction)
-        return push / resistance
+@compilable
+def begun(axis: Axis, q: Array, v: Array, faster: Array, u: Array, push: Array) -> State:
+    """The state of axes whose encoders show `q`, `v` and their acceleration: a spring carries the load's weight, and
+    the integral action what the command `u` does not."""
+    pull = axis.weight * np.sin(q + axis.hang) + push
+    sag = axis.slack * pull
+    load = pull + axis.whole * faster + axis.viscous * v + axis.coulomb * np.sign(v)
+    held = pick(axis.integral > 0, load - axis.gain * (u - q), 0.0 * q)
+    at_motor = axis.at_motor > 0
+    return State(pick(at_motor, q, q + sag), v, pick(at_motor, q - sag, q), v, held)
+
+
+@compilable
+def advanced(axis: Axis, has: Has, state: State, given: Sample, parts: int) -> State:
+    """The state at the next sample, in so many parts."""
+    fixed = _fixed(axis, has, given, parts)
+    slope, risen = (given.after - given.before) / parts, given.pushed - given.push
+    for i in range(parts):
+        before, first, last = given.before + i * slope, (i + GAMMA) / parts, (i + 1.0) / parts
+        asked = before + GAMMA * slope + first * (1 - first) * given.bend
+        middle = _stage(axis, has, fixed, state, asked, given.push + first * risen)
+        between = State(
+            state.q + _AHEAD * (middle.q - state.q),
+            state.v + _AHEAD * (middle.v - state.v),
+            state.x + _AHEAD * (middle.x - state.x),
+            state.w + _AHEAD * (middle.w - state.w),
+            state.held + _AHEAD * (middle.held - state.held),
+        )
+        asked = before + slope + last * (1 - last) * given.bend
+        state = _stage(axis, has, fixed, between, asked, given.push + last * risen)
+    return state
+
+
+@compilable
+def _fixed(axis: Axis, has: Has, given: Sample, parts: int) -> _Fixed:
+    """What all stages of a sample have in common."""
+    h, strength = given.step * (GAMMA / parts), np.maximum(1 + axis.supply * given.supply, 0.0)
+    dry = axis.coulomb * np.maximum(1 + axis.thermal * given.warm, 0.0)
+    gain, limit, mass = axis.gain * strength, axis.limit * strength, axis.inertia / h
+    light, over, drag, follows = mass + axis.viscous, h, h, h
+    if has.soft:
+        over, drag = axis.flexibility / h, h + axis.drag
+        follows = drag / (over + drag)
+        light = light + axis.stiffness * drag * (1 - follows)
+    rate = gain * axis.integral
+    gain = gain + rate * h
+    return _Fixed(h, gain, rate, limit, dry, mass, np.maximum(light, TINY), gain * h, over, drag, follows)
+
+
+@compilable
+def _pulling(axis: Axis, has: Has, q: Array, push: Array) -> Array:
+    """Torque of the weight and of the other joints at a position."""
+    if has.heavy:
+        return axis.weight * np.sin(q + axis.hang) + push
+    return push
+
+
+@compilable
+def _stage(axis: Axis, has: Has, fixed: _Fixed, state: State, u: Array, push: Array) -> State:
+    """The state at the end of a stage."""
+    h, limit, q, v, x, w, held = fixed.h, fixed.limit, state.q, state.v, state.x, state.w, state.held
+    motor = fixed.gain * (u - q) + held
+    # What the gear carries beside the motor's torque.
+    carried = _pulling(axis, has, q, push)
+    against, loose = carried, q
+    if has.soft:
+        apart, pulled = q - x, _pulling(axis, has, x, push)
+        # The load's speed at the end of the stage is this and `follows` times the motor's.
+        loose = (fixed.over * w + apart - axis.slack * pulled) / (fixed.over + fixed.drag)
+        carried = pick(axis.hung > 0, pulled, carried)
+        against = pick(axis.hung > 0, axis.stiffness * (apart - fixed.drag * loose), against)
+    free = fixed.mass * v - against
+    light = fixed.light
+    if has.waves:
+        # Linearised, and no steeper than a stage can follow, the less so the more of a wave it passes without a mass:
+        # else the last digit would decide where it goes.
+        passed = np.square(axis.order * h * v)
+        steepest = _STEEP * (light - fixed.mass + fixed.stiff) / (1.0 + passed) + _SWINGING * fixed.mass
+        wave = np.minimum(axis.wave * axis.order, steepest / h)
+        free = free - wave / axis.order * np.sin(axis.order * q + axis.phase)
+        light = light + h * wave * np.cos(axis.order * q + axis.phase)
+    friction = fixed.dry
+    if has.stribeck:
+        # It falls with the speed of the stage before, no steeper than that an axis without mass forgets it.
+        least = _STEEPEST * axis.stribeck / (_STEEP * (light - fixed.mass + fixed.stiff) + fixed.mass)
+        friction = friction + axis.stribeck * np.exp(-np.square(v / np.maximum(axis.stribeck_speed, least)))
+    speed = _solved(axis, has, free, motor, friction, carried, light, fixed.stiff)
+    if has.weak:
+        # The part of the damping that the drive makes is within its limit.
+        torque = motor - (fixed.stiff + axis.drive_damping) * speed
+        most = np.minimum(np.maximum(torque, -limit), limit)
+        lighter = np.maximum(light - axis.drive_damping, TINY)
+        weak = _solved(axis, has, free, most, friction, carried, lighter, 0.0 * most)
+        speed = pick(torque == most, speed, weak)
+    speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)
+    end = q + h * speed
+    if has.soft:
+        w = np.minimum(np.maximum(loose + fixed.follows * speed, -_FASTEST), _FASTEST)
+        x = x + h * w
+    if has.integral:
+        # Beyond the limit of the motor it stands still (anti-windup).
+        held = np.minimum(np.maximum(held + fixed.rate * h * (u - end), -limit), limit)
+    return State(end, speed, x, w, held)
+
+
+@compilable
+def _solved(
+    axis: Axis, has: Has, free: Array, motor: Array, friction: Array, carried: Array, light: Array, stiff: Array
+) -> Array:
+    """Speed under all torques against dry friction; stiff: how fast the motor's falls with it."""
+    resistance, push = light + stiff, free + motor
+    if has.load_friction:
+        load = motor + carried
+        friction = friction + axis.load_friction * np.abs(load)
+        resistance = resistance - axis.load_friction * stiff * np.sign(push * load)
+    if has.dry:
+        push = push - np.minimum(np.maximum(push, -friction), friction)
+    return push / resistance
 
 
 def wave_of(sine: Array, cosine: Array) -> tuple[Array, Array]:
     """Size and phase of a sine and a cosine."""
     return np.hypot(sine, cosine), np.arctan2(cosine, sine)
-
-
-def load_inertia(a: Mapping[str, Array]) -> Array:
-    """Inertia behind a joint: that of the load, or where it is not known all of the axis'."""
-    return np.where(a["load"] > 0, a["load"], a["inertia"])

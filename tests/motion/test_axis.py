@@ -192,9 +192,31 @@ def test_an_axis_moves_the_same_beside_any_other() -> None:
         assert np.array_equal(lot([one], command(0, TIME))[0], row), one
 
 
+def test_compiled_or_not_an_axis_moves_the_same() -> None:
+    time = torch.from_numpy(TIME).expand(2, -1)
+    asked = torch.stack([torch.from_numpy(command(k, TIME)) for k in (0, 1)])
+    start = torch.stack([asked[:, 0], asked.new_tensor([0.0, 0.4]), asked.new_tensor([0.0, 2.0])], -1)
+    uneven = {"supply": 0.1 * torch.sin(time), "warm": 5 * time, "torque": 0.01 * torch.cos(time)}
+    drive = Drive(time, asked, start, **uneven, bent=asked.new_tensor([0.0, 0.9]))
+    generator = torch.Generator().manual_seed(0)
+    names, sets = list(ABSENT), 40
+    # Each of the sets has some of what an axis may have.
+    has = torch.rand(len(names), sets, 1, generator=generator) < 0.4
+    sizes = torch.rand(len(names), sets, 1, generator=generator, dtype=torch.float64)
+    many = {"cogging_order": 20.0, "gain": 2.0, "stribeck_speed": 0.5, "weakness": 8.0, "integral": 4.0}
+    values = {n: torch.where(h, many.get(n, 0.05) * v, ABSENT[n]) for n, h, v in zip(names, has, sizes, strict=True)}
+    ways = [simulate_axes(drive, values, fast) for fast in (False, True)]
+    assert ways[0].std() > 0.1
+    torch.testing.assert_close(*ways, rtol=0, atol=1e-10)
+
+
 def test_the_last_digit_of_a_command_decides_nothing() -> None:
     sets = [{"cogging_sin": 0.04, "cogging_order": 84.0}, {"stribeck": 0.05, "stribeck_speed": 0.02, "viscous": 0.01}]
     sets += [{"stribeck": 0.1, "coulomb": 0.05, "load_friction": 0.3}, OWN | {"stribeck": 0.1, "stribeck_speed": 0.01}]
+    sets += [
+        {"stribeck": 0.013, "stribeck_speed": 1.85},
+        {"cogging_sin": 0.1, "cogging_cos": 0.1, "cogging_order": 60.0},
+    ]
     sets += [{"inertia": 1e-6, "cogging_sin": 0.03, "cogging_order": 150.0, "coulomb": 0.01}]
     asked = command(1, TIME)
     rounded = asked * (1 + 2.3e-16 * np.random.default_rng(1).choice([-1, 0, 1], len(asked)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -73,6 +74,22 @@ def test_the_command_on_a_real_servo(tmp_path: Path, cli: Cli) -> None:
     assert "course" in page and "What should be recorded next?" in page
     assert (out / "next_measurements.csv").read_text().startswith("time[s],command1[rad]\n")
     assert (out / "diagnosis.md").is_file()
+
+
+def test_rounding_decides_no_verdict_on_a_real_servo() -> None:
+    logs = load_logs([DATA / f"servo_{name}.csv" for name in ("sin_sin", "up_and_down")])
+    nominal, said, ripples = nominal_of("servo", {}, ["rad"]), [], []
+    for seed in (0, 1):
+        signs = np.random.default_rng(seed).choice([-1, 0, 1], len(logs[0].time))
+        moved = [replace(log, command=log.command * (1 + 2e-16 * signs[: len(log.time), None])) for log in logs]
+        ripples.append(problem_of(moved, nominal, motion_effects(["cogging"])).library.facts[0].ripples)
+        # A lag is a gain or viscous friction: the two tie.
+        said.append(diagnose_motion(moved, nominal, ["gravity", "servo_gain", "viscous", "stribeck"]).content)
+    assert ripples[0] == ripples[1] != ()
+    first, second = said
+    assert first["verdict"]["effects"] == second["verdict"]["effects"] != []
+    assert first["verdict"]["probability"] == pytest.approx(second["verdict"]["probability"], abs=1e-4)
+    assert first["gap"]["after"] == pytest.approx(second["gap"]["after"], rel=1e-4)
 
 
 def test_a_mechanism_file_gives_joints_that_follow_their_commands(tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from motion.servo import GAIN, KEYS, command, moved, write_log
 
+from ccnn_torch.diagnosis.page.data import About
+from ccnn_torch.diagnosis.page.first_screen import first_screen
 from ccnn_torch.diagnosis.verdict.findings import findings
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion import (
@@ -171,6 +173,13 @@ def test_what_one_joint_of_an_arm_does_is_no_finding_at_the_others(tmp_path: Pat
     names = found.problem.library.names
     assert [names[m] for m in second.best.members] == ["viscous"]
     assert first.best.members == () and first.probability > 0.9
+    # Each joint has a verdict, and a line of a table.
+    each = found.content["joints"]
+    assert [j["effects"] for j in each] == [[], ["viscous"]] and each[1]["gap_after"] < 0.1 * each[1]["gap_before"]
+    assert found.content["verdict"]["probability"] == min(first.probability, second.probability)
+    table = next(a.table for a in first_screen(found.content, About()) if a.label == "How sure")
+    assert table is not None and [row[:2] for row in table.rows] == [("q1", "–"), ("q2", "viscous friction")]
+    assert table.rows[1][2].startswith("10") and "at the least sure joint" in found.content["verdict"]["text"]
     told = next(e for e in found.content["effects"] if e["name"] == "viscous")["parameters"]
     assert {name: v["value"] for name, v in told.items()} == {"q2 viscous": pytest.approx(10.0, rel=0.02)}
 

@@ -17,6 +17,7 @@ from ccnn_torch.diagnosis.verdict.findings import (
     told_words,
 )
 from ccnn_torch.diagnosis.verdict.text import (
+    LEAST,
     capital,
     follows_words,
     in_doubt,
@@ -49,7 +50,7 @@ def first_screen(results: Block, about: About, most: int = ON_PAGE) -> list[Answ
     said = [Answer("What is wrong", _wrong(results))]
     if where := where_words(results, about):
         said.append(Answer("Where", f"{capital('; '.join(where))}."))
-    said.append(Answer("How sure", _sure(results)))
+    said.append(Answer("How sure", _sure(results), table=joints_table(results)))
     if removed := _removed(results):
         said.append(Answer("What it removes", removed))
     if look := " ".join(f.look for f in findings(results)):
@@ -83,7 +84,9 @@ def _wrong(results: Block) -> str:
 
 def _sure(results: Block) -> str:
     verdict = results["verdict"]
-    text = f"Probability {probability_words(verdict['probability'])}"
+    text = (
+        f"Probability {probability_words(verdict['probability'])}{f' {LEAST}' * (len(results.get('joints', ())) > 1)}"
+    )
     if in_doubt(results):
         text += "; the noise is not known, and what is taken for it may hold another cause"
     return f"{text}."
@@ -289,6 +292,31 @@ def numbers_table(results: Block, most: int) -> Table | None:
         notes.append(f"{left_out} more that are clearly not 0 are in diagnosis.json.")
     notes.append("The intervals hold if nothing else acts and the rest of the model is right.")
     return Table("Numbers to enter", columns, cells, " ".join(notes))
+
+
+def joints_table(results: Block) -> Table | None:
+    """The verdict on each joint of a motion; None where there is one joint alone."""
+    joints, by_name = results.get("joints", []), {e["name"]: e for e in results["effects"]}
+    if len(joints) < 2:
+        return None
+    rows = []
+    for own in joints:
+        name, said, rest = own["joint"], [], []
+        for effect in own["effects"]:
+            numbers = by_name[effect]["parameters"]
+            said += [
+                told_words(b, b["value"]) for n, b in clear_parameters(numbers).items() if n.startswith(f"{name} ")
+            ]
+            rest += [f"or {words_of(other).short}" for other in own["classes"].get(effect, ())]
+        if own["driver"]:
+            rest.append(follows_words(own | {"drivers": []}).replace("follows", "a rest follows"))
+        what = ", ".join(words_of(effect).short for effect in own["effects"]) or "–"
+        removed = " → ".join(size_text(own[key], results["gap"]) for key in ("gap_before", "gap_after"))
+        sure = probability_words(own["probability"])
+        rows.append((name, what, ", ".join(said) or "–", sure, removed, "; ".join(rest) or "–"))
+    columns = ("joint", "what is wrong", "number", "how sure", "gap", "or, and what is left")
+    note = "Probability of each joint's names, those that cannot be told apart taken as one; gaps are of runs held out."
+    return Table("Each joint", columns, rows, note)
 
 
 def _named(name: str, part: str) -> str:

@@ -19,6 +19,8 @@ Block = Mapping[str, Any]
 SURE = 0.95
 """From this probability on a verdict is said as a fact, below it as the likeliest explanation."""
 
+LEAST = "at the least sure joint"
+"""Whose probability is told of several joints."""
 # Below this probability the rows determine no verdict: it is but the likeliest of many.
 _OPEN = 0.05
 # What is left beyond so many steps of an encoder is not its noise.
@@ -150,7 +152,7 @@ def verdict_text(results: Block) -> str:
         said.append(f"{capital(open_)}.")
     if verdict["none"]:
         none = "The likeliest is none beyond the noise" if open_ else "No cause beyond the noise is to be seen"
-        said.append(f"{none} ({_probability(verdict)}).")
+        said.append(f"{none} ({_probability(results)}).")
     else:
         said.append(_cause(results))
     doubts = (f"{'And' if i else 'But'} {caution}." for i, caution in enumerate(results.get("cautions", ())))
@@ -261,14 +263,14 @@ def _cause(results: Block) -> str:
     names = list(verdict["effects"])
     if names == ["outlier"]:
         rows = count_text(len(results["rows_set_aside"]), "bad row")
-        return f"It comes from {rows}, set aside, and from no effect of the library ({_probability(verdict)})."
+        return f"It comes from {rows}, set aside, and from no effect of the library ({_probability(results)})."
     if verdict["outside_library"] or not names:
         follows = follows_words(verdict)
         if not names:
-            return f"{_none_of(results)} explains it: the residual {follows} ({_probability(verdict)})."
+            return f"{_none_of(results)} explains it: the residual {follows} ({_probability(results)})."
         verb = "explains" if len(names) == 1 else "together explain"
         text = f"{capital(listed([effect_words(n) for n in names]))} {verb} part of it{_removed(results, ', ')}; "
-        return f"{text}the rest {follows}, and {no_effect_words(results)} describes it ({_probability(verdict)})."
+        return f"{text}the rest {follows}, and {no_effect_words(results)} describes it ({_probability(results)})."
     by_name = {e["name"]: e for e in results["effects"]}
     classes = {e["name"]: [n for n in e["indistinguishable_from"] if n not in names] for e in results["effects"]}
     likes = [classes.get(name, []) for name in names]
@@ -280,7 +282,7 @@ def _cause(results: Block) -> str:
     else:
         verb = "together explain it" if sure else "together are the likeliest explanation"
     comma = "," if likes[-1] else ""
-    return f"{capital(subject)}{comma} {verb} ({_probability(verdict)}){_removed(results, ' and would remove ')}."
+    return f"{capital(subject)}{comma} {verb} ({_probability(results)}){_removed(results, ' and would remove ')}."
 
 
 def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
@@ -335,8 +337,9 @@ def _times(ratio: float) -> str:
     return f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.1f}" if ratio >= 0.1 else f"{ratio:.1g}"
 
 
-def _probability(verdict: Block) -> str:
-    return f"probability {probability_words(verdict['probability'])}"
+def _probability(results: Block) -> str:
+    least = f" {LEAST}" * (len(results.get("joints", ())) > 1)
+    return f"probability {probability_words(results['verdict']['probability'])}{least}"
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:

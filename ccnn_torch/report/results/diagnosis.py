@@ -157,6 +157,18 @@ class Verdict(Result):
     text: str
 
 
+class JointVerdict(Result):
+    joint: str
+    effects: list[str]
+    classes: dict[str, list[str]]
+    """of each effect what can stand in its place at this joint"""
+    probability: float
+    driver: str | None
+    """what a rest follows that no effect describes; null where there is none"""
+    gap_before: float
+    gap_after: float
+
+
 class NextMotion(Result):
     joint: str
     kind: str
@@ -234,6 +246,9 @@ class DiagnosisResults(Result):
     """what a network trained on what the effects leave would still gain on rows not used for training; null where it
     was not asked for"""
     verdict: Verdict
+    """of a motion of several joints, its probability is that of the least sure one"""
+    joints: list[JointVerdict] = []
+    """of a motion the verdict on each joint; their numbers are in effects"""
     next_measurements: list[NextMeasurement]
     missing_covariates: list[MissingColumns]
     """columns that were not recorded and would bring further effects into sight, most promising first, with the

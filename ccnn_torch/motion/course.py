@@ -1,0 +1,217 @@
+"""The course of an axis from sample to sample: its command, its motion, and its play.
+
+Every row of an array is a number where the axes go one after the other, compiled; in numpy it is one of all axes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccnn_torch.motion.compilable import compilable, fixed_tuple, loop, pick
+from ccnn_torch.motion.stage import TINY, Array, Axis, Has, Sample, advanced, begun, each_has
+
+
+@compilable
+def course(
+    axis: Axis,
+    has: Has,
+    step: Array,
+    u: Array,
+    start: Array,
+    bent: Array,
+    push: Array,
+    supply: Array,
+    warm: Array,
+    parts: int,
+) -> Array:
+    """What encoders show, `s` rows.
+
+    Args:
+        axis, has: the axes, and what some of them have.
+        step: time from each sample to the next, `s - 1` rows.
+        u: the command, late and offset already, `s` rows.
+        start: position, speed and acceleration, 3 rows.
+        bent: as of `Drive`, a row.
+        push, supply, warm: as of `Drive`; `s` rows, or one where there is nothing.
+        parts: into how many every step is divided.
+    """
+    q, v = start[0], start[1]
+    if has.slow:
+        u = _limited(axis, step, u, q, v, push[0])
+    if has.led:
+        u = _led(axis, step, u)
+    state = begun(axis, q, v, start[2], u[0], push[0])
+    found, driven = np.empty_like(u), axis.at_motor > 0
+    found[0] = pick(driven, state.q, state.x)
+    for k in range(len(step)):
+        after, late = min(k + 1, len(push) - 1), min(k + 1, len(supply) - 1)
+        state = advanced(
+            axis,
+            has,
+            state,
+            Sample(
+                step[k],
+                u[k],
+                u[k + 1],
+                bent * _bend(u, k),
+                push[min(k, len(push) - 1)],
+                push[after],
+                supply[late],
+                warm[min(k, len(warm) - 1)],
+            ),
+            parts,
+        )
+        found[k + 1] = pick(driven, state.q, state.x) if has.soft else state.q
+    if not has.play:
+        return found
+    behind = _played(axis, found)
+    if has.hung:
+        hung = _hung(axis, step, found, push)
+        for k in range(len(hung)):
+            behind[k] = pick(axis.play_loaded > 0, hung[k], behind[k])
+    return behind
+
+
+@compilable
+def _limited(axis: Axis, step: Array, u: Array, q: Array, v: Array, push: Array) -> Array:
+    """Commands that change no faster than the drive allows, and may be behind already where they begin: there an axis
+    moves as it does at its start, but for its friction and inertia."""
+    load = axis.weight * np.sin(q + axis.hang) + (axis.viscous - axis.damping) * v + push
+    slow, fastest = axis.slowness > 0, 1 / np.maximum(axis.slowness, TINY)
+    found = u.copy()
+    found[0] = pick(slow, q + load / np.maximum(axis.gain, TINY), u[0])
+    for k in range(len(step)):
+        reach = fastest * step[k]
+        limited = found[k] + np.minimum(np.maximum(u[k + 1] - found[k], -reach), reach)
+        found[k + 1] = pick(slow, limited, u[k + 1])
+    return found
+
+
+@compilable
+def _led(axis: Axis, step: Array, u: Array) -> Array:
+    """Commands with what a derivative gain adds to them; less what the integral action would make of that, which
+    integrates the commands alone."""
+    found, last = u.copy(), len(step) - 1
+    lead = before = 0.0 * u[0]
+    for k in range(len(u)):
+        a, b = max(k - 1, 0), min(k, last)
+        between = step[b] if a == b else step[a] + step[b]
+        now = axis.derivative * (u[b + 1] - u[a]) / between
+        fades = 0.5 * axis.integral * step[a]
+        faded = (lead * (1 - fades) + now - before) / (1 + fades)
+        lead = pick((axis.integral > 0) & (k > 0), faded, now)
+        before = now
+        found[k] = u[k] + lead
+    return found
+
+
+@compilable
+def _bend(u: Array, k: int) -> Array:
+    """Four times what a parabola through the samples is above the middle of a straight line, from one sample to the
+    next; 0 at a jump or corner."""
+    last = len(u) - 3
+    i, j = min(max(k - 1, 0), last), min(k, last)
+    a, b = (u[i + 2] - u[i + 1]) - (u[i + 1] - u[i]), (u[j + 2] - u[j + 1]) - (u[j + 1] - u[j])
+    found: Array = pick(a * b > 0, -0.5 * np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0.0 * a)
+    return found
+
+
+@compilable
+def _played(axis: Axis, q: Array) -> Array:
+    """The driven side of a play, which rests in the middle at first."""
+    found, half = q.copy(), 0.5 * axis.play
+    for k in range(1, len(q)):
+        found[k] = np.maximum(np.minimum(found[k - 1], q[k] + half), q[k] - half)
+    return found
+
+
+@compilable
+def _hung(axis: Axis, step: Array, q: Array, push: Array) -> Array:
+    """The driven side of a play, which is free between its ends but for its friction, and does not bounce there."""
+    found, half, fall = q.copy(), 0.5 * axis.play, axis.weight * axis.light
+    x = q[0] - half * np.sign(fall * np.sin(q[0] + axis.hang) + push[0] * axis.light)
+    v = 0.0 * x
+    found[0] = x
+    for k in range(len(step)):
+        h = step[k]
+        v = v - h * (fall * np.sin(x + axis.hang) + push[min(k, len(push) - 1)] * axis.light)
+        # Its bearing brakes it, up to standstill.
+        v = np.sign(v) * np.maximum(np.abs(v) - h * axis.play_friction, 0.0)
+        free = x + h * v
+        x = np.minimum(np.maximum(free, q[k + 1] - half), q[k + 1] + half)
+        v = pick(x == free, v, (q[k + 1] - q[k]) / h)
+        found[k + 1] = x
+    return found
+
+
+@compilable
+def _late(time: Array, values: Array, delay: Any) -> Array:
+    """Values a delay earlier, linear between samples, the first one before the first sample."""
+    found, after = np.empty_like(values), 1
+    for k in range(len(time)):
+        wanted = time[k] - delay
+        while after < len(time) - 1 and time[after] < wanted:
+            after += 1
+        while after > 1 and time[after - 1] >= wanted:
+            after -= 1
+        share = (wanted - time[after - 1]) / (time[after] - time[after - 1])
+        found[k] = values[after - 1] + (values[after] - values[after - 1]) * min(max(share, 0.0), 1.0)
+    return found
+
+
+_OF_AXIS, _OF_HAS = len(Axis._fields), len(Has._fields)
+
+
+def compiled(
+    axis: Axis,
+    offset: Array,
+    time: Array,
+    command: Array,
+    start: Array,
+    bent: Array,
+    push: Array,
+    supply: Array,
+    warm: Array,
+    parts: NDArray[np.int64],
+) -> Array:
+    """Courses of `c` axes, one after the other, `c x s`.
+
+    Args:
+        axis: the axes.
+        offset: of their positions, `c`.
+        time, command: `b x s`; axis `j` has row `j % b` of these and of the others.
+        start: `b x 3`.
+        bent: `b`.
+        push, supply, warm: `b x s`, or `b x 1` where there is nothing.
+        parts: into how many the steps are divided, `c`.
+    """
+    every, each = (np.stack(v, -1) for v in (axis, each_has(axis)))
+    return _courses(every, each, offset, time, command, start, bent, push, supply, warm, parts)
+
+
+@loop
+def _courses(
+    every: Array,
+    each: NDArray[np.bool_],
+    offset: Array,
+    time: Array,
+    command: Array,
+    start: Array,
+    bent: Array,
+    push: Array,
+    supply: Array,
+    warm: Array,
+    parts: NDArray[np.int64],
+) -> Array:
+    found = np.empty((len(every), time.shape[1]))
+    for j in range(len(every)):
+        b = j % len(time)
+        axis, has = Axis(*fixed_tuple(every[j], _OF_AXIS)), Has(*fixed_tuple(each[j], _OF_HAS))
+        u = _late(time[b], command[b], axis.delay) if axis.delay != 0 else command[b].copy()
+        u += offset[j]
+        step = time[b, 1:] - time[b, :-1]
+        found[j] = course(axis, has, step, u, start[b], bent[b], push[b], supply[b], warm[b], parts[j])
+    return found
