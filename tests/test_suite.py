@@ -18,8 +18,7 @@ from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.report.results.run import RunResults
-from ccnn_torch.study.suite import compare, load_suite, run_suite, write_suite
-from ccnn_torch.study.suite_page import suite_page
+from ccnn_torch.study.suite import compare, load_suite, run_suite, suite_page, write_suite
 
 # Its figures are looked at.
 DRAWN = True
