@@ -14,6 +14,7 @@ from ccnn_torch.calibration.page.tables import write_tables
 from ccnn_torch.calibration.result import by_score
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.mechanisms import Instrument
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.results.run import ModelFiles
@@ -67,7 +68,8 @@ def _arrays(calibration: Calibration) -> RunArrays:
     test = torch.zeros(rows, dtype=torch.bool)
     test[prepared.dataset.splits[k].test] = True
     # A machine that mostly turns has its errors spread over angles, not over places.
-    turns = sum(coordinate.unit == "m" for coordinate in mechanism.pose) < 2
+    hand = _numpy(mechanism.hand(prepared.joints[k])) if isinstance(mechanism, Instrument) else None
+    turns = hand is None and sum(coordinate.unit == "m" for coordinate in mechanism.pose) < 2
     axes = mechanism.pose if turns else tuple(Coordinate(name, "m") for name in "xyz")
 
     def place(poses: Tensor) -> NDArray[np.float64]:
@@ -85,7 +87,7 @@ def _arrays(calibration: Calibration) -> RunArrays:
         measured=_numpy(whole),
         predicted=_numpy(outcome.deviation[k] + (whole - learned)),
         test=test.numpy(),
-        place=place(prepared.pose[k]),
+        place=hand if hand is not None else place(prepared.pose[k]),
         position_before=_numpy(calibration.before.position[k]),
         position_after=_numpy(outcome.after.position[k]),
         rotation_before=None if calibration.before.rotation is None else _numpy(calibration.before.rotation[k]),

@@ -14,7 +14,7 @@ from torch import Tensor
 from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap
 from ccnn_torch.display import count_text
-from ccnn_torch.mechanisms import PoseError, as_measured
+from ccnn_torch.mechanisms import Instrument, PoseError, as_measured
 from ccnn_torch.records import check_rows, load_records
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.results.base import Length
@@ -169,13 +169,15 @@ def rms_of(values: Tensor) -> float | None:
 
 
 def figure_arrays(rows: Rows, measured: Tensor, left: Tensor, before: PoseError, after: PoseError) -> RunArrays:
+    mechanism = rows.mechanism
+    place = mechanism.hand(rows.joints) if isinstance(mechanism, Instrument) else mechanism.frame(rows.whole)[0]
     return RunArrays(
         joints=rows.mechanism.joints,
         commanded=rows.joints.numpy(),
         measured=measured.detach().numpy(),
         predicted=(measured - left).detach().numpy(),
         test=np.ones(len(rows.joints), dtype=np.bool_),
-        place=rows.mechanism.frame(rows.whole)[0].numpy(),
+        place=place.numpy(),
         position_before=before.position.detach().numpy(),
         position_after=after.position.detach().numpy(),
         rotation_before=None if before.rotation is None else before.rotation.detach().numpy(),
