@@ -292,7 +292,8 @@ def _arrays(calibration: Calibration) -> RunArrays:
     test = torch.zeros(rows, dtype=torch.bool)
     test[prepared.dataset.splits[k].test] = True
     # A machine that mostly turns has its errors spread over angles, not over places.
-    turns = sum(coordinate.unit == "m" for coordinate in mechanism.pose) < 2
+    hand = _numpy(mechanism.hand(prepared.joints[k])) if isinstance(mechanism, Instrument) else None
+    turns = hand is None and sum(coordinate.unit == "m" for coordinate in mechanism.pose) < 2
     axes = mechanism.pose if turns else tuple(Coordinate(name, "m") for name in "xyz")
 
     def place(poses: Tensor) -> NDArray[np.float64]:
@@ -310,7 +311,7 @@ def _arrays(calibration: Calibration) -> RunArrays:
         measured=_numpy(whole),
         predicted=_numpy(outcome.deviation[k] + (whole - learned)),
         test=test.numpy(),
-        place=place(prepared.pose[k]),
+        place=hand if hand is not None else place(prepared.pose[k]),
         position_before=_numpy(calibration.before.position[k]),
         position_after=_numpy(outcome.after.position[k]),
         rotation_before=None if calibration.before.rotation is None else _numpy(calibration.before.rotation[k]),

@@ -161,10 +161,10 @@ class _Model:
     def begin(self, parameters: Tensor) -> Tensor:
         """The vector of a machine without effects."""
         # Each column is of one parameter, in all rows or in those of a group.
-        spread = self.spread if self.spread.dim() > 2 else self.spread[None]
-        change = (parameters - self.nominal).expand(spread.shape[:-1])
-        change = (spread * change[..., None]).sum((0, 1)) / spread.sum((0, 1)) / self.sizes[-1]
-        return torch.cat([change.new_zeros(self.size - len(change)), change])
+        spread = self.spread if self.spread.dim() == 3 else self.spread[None]
+        change = (parameters - self.nominal).expand(spread.shape[:-1])[..., None]
+        found = (spread * change).sum((0, 1)) / spread.sum((0, 1)) / self.sizes[-1]
+        return torch.cat([found.new_zeros(self.size - len(found)), found])
 
     def acting(self, at: Tensor) -> list[Acting]:
         """The effects."""

@@ -30,11 +30,24 @@ def holder(results: Mapping[str, Any]) -> str:
     return _HOLDERS[results["constraint"]["kind"]]
 
 
+def _readings_table(readings: Mapping[str, Any]) -> Table:
+    """What instruments read: noise and RMS of each."""
+    rows = []
+    for name, block in readings.items():
+        scale, unit = display_unit(block["unit"], block["noise"])
+        sizes = (number_text(block[key] / scale, 3) for key in ("before", "after", "noise"))
+        rows.append((f"{name} [{unit}]", str(block["rows"]), *sizes, "given" if block["noise_known"] else "estimated"))
+    note = "Off by, RMS over the rows that were fitted; readings of one instrument in one unit share a noise."
+    return Table("Readings", ("reading", "rows", "before", "after", "noise", "which is"), tuple(rows), note)
+
+
 def constraint_table(results: Mapping[str, Any]) -> Table | None:
     """Positions of plates, anchors or planes, with standard deviations."""
     about = results.get("constraint")
     if about is None:
         return None
+    if about.get("readings"):
+        return _readings_table(about["readings"])
     rows = []
     for name, block in about["unknowns"].items():
         scale, unit = display_unit(block["unit"], block["sd"] or 1.0)

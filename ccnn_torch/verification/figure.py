@@ -52,7 +52,7 @@ def pose_rows_plot(arrays: RunArrays) -> Plot:
     size = float(np.clip(40 / np.sqrt(len(row)), 1.5, 5))
     panels = figure.subplots(len(pairs), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (title, si_unit, before, after) in zip(panels, pairs, strict=True):
-        scale, unit = display_unit(si_unit, float(np.median(before)))
+        scale, unit = display_unit(si_unit, float(np.nanmedian(before)))
         for values, colour, label in ((before, BEFORE, "before"), (after, AFTER, "after")):
             axes.plot(row, values / scale, "o", color=colour, markersize=size, label=label, rasterized=raster)
         axes.set_ylabel(f"{title} [{unit}]")

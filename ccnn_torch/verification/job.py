@@ -390,13 +390,15 @@ def rms_of(values: Tensor) -> float | None:
 
 
 def figure_arrays(rows: Rows, measured: Tensor, left: Tensor, before: PoseError, after: PoseError) -> RunArrays:
+    mechanism = rows.mechanism
+    place = mechanism.hand(rows.joints) if isinstance(mechanism, Instrument) else mechanism.frame(rows.whole)[0]
     return RunArrays(
         joints=rows.mechanism.joints,
         commanded=rows.joints.numpy(),
         measured=measured.detach().numpy(),
         predicted=(measured - left).detach().numpy(),
         test=np.ones(len(rows.joints), dtype=np.bool_),
-        place=rows.mechanism.frame(rows.whole)[0].numpy(),
+        place=place.numpy(),
         position_before=before.position.detach().numpy(),
         position_after=after.position.detach().numpy(),
         rotation_before=None if before.rotation is None else before.rotation.detach().numpy(),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +17,16 @@ from ccnn_torch import diagnose
 from ccnn_torch.api import identify
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.compensation import load_compensation
 from ccnn_torch.diagnosis.from_records import situation_of
+from ccnn_torch.diagnosis.page.outputs import write_diagnosis
 from ccnn_torch.effects import Acting, make_effect, reached, signature
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.planning.job import make_plan
 from ccnn_torch.records import load_records
-from ccnn_torch.verification.job import verify_model
 
+Cli = Callable[..., tuple[int, str, str]]
 ANCHORS = np.array([[1.2, 0.3, 0.1], [-0.8, 1.1, 0.4]])
 MOUNT = turn([0.01, -0.02, 0.015])
 NOISE = {"level": 1e-5, "wire": 2e-5, "pose": 3e-5}
@@ -135,7 +137,7 @@ def test_no_instrument_alone_determines_the_arm_and_all_together_do(tmp_path: Pa
     assert elsewhere(tips_of(again.mechanism()), arm) < 1.2 * together
 
 
-def test_every_command_takes_rows_of_several_instruments(tmp_path: Path) -> None:
+def test_every_command_takes_rows_of_several_instruments(tmp_path: Path, cli: Cli) -> None:
     arm, kinds = Arm(4), ["level", "wire", "pose"]
     records, _ = table(tmp_path, arm, kinds, 5)
     keys: dict[str, Any] = {"mechanism": str(arm_file(tmp_path, frames=False)), "instruments": INSTRUMENTS}
@@ -143,18 +145,21 @@ def test_every_command_takes_rows_of_several_instruments(tmp_path: Path) -> None
     said = diagnose(load_records(str(records), machine), machine, network=False)
     assert set(said.verdict["effects"]) <= {"geometry", "joint_offset"} and said.verdict["effects"]
     assert said.by_block["after"] < 0.1 * said.by_block["before"]
-    about = {"records": str(records), "mechanism": "instrument", "mechanism_keys": keys}
-    found = calibrate(RunConfig.from_keys(**about, geometry="identify", effects="none"))
-    pose = found.results.pose
-    assert pose.rotation is not None
-    before, after = pose.position.before.rms.median, pose.position.after.rms.median
-    assert before is not None and after is not None and after < 0.05 * before
-    found.save(tmp_path / "model", forms=["safetensors"])
+    write_diagnosis(tmp_path / "why", said)
+    assert (tmp_path / "why" / "report.html").is_file()
+    config = {"records": str(records), "mechanism": "instrument", "mechanism_keys": keys, "effects": "none"}
+    (tmp_path / "arm_run.yaml").write_text(json.dumps(config))
+    code, _, told = cli("run", tmp_path / "arm_run.yaml", f"out={tmp_path / 'run'}")
+    assert code == 0 and (tmp_path / "run" / "report.html").is_file(), told
+    pose = json.loads((tmp_path / "run" / "results.json").read_text())["pose"]
+    for block in (pose["position"], pose["rotation"]):
+        assert block["after"]["rms"]["median"] < 0.05 * block["before"]["rms"]["median"]
     # Another day, another table: of the wires alone, whose anchors are fitted to it.
     later, _ = table(tmp_path, arm, ["wire"], 9)
-    model = load_compensation(tmp_path / "model" / "model.safetensors")
-    judged = verify_model(model, str(later), "instrument", mechanism_keys=keys).results
-    assert judged.position.after.rms < 0.1 * judged.position.before.rms
+    words = (tmp_path / "run" / "model.safetensors", later, "--config", tmp_path / "arm_run.yaml")
+    code, _, told = cli("verify", *words, "--out", tmp_path / "later")
+    judged = json.loads((tmp_path / "later" / "verify.json").read_text())["position"]
+    assert judged["after"]["rms"] < 0.1 * judged["before"]["rms"], told
     _, plans = make_plan(machine, 30, PlanConfig.from_file(None, ["candidates=60"]))
     assert bool(torch.isfinite(plans[0].pose).all()) and set(plans[0].pose[:, 6].tolist()) == {1.0, 2.0}
 

@@ -175,7 +175,8 @@ def machine_plot(arrays: Mapping[str, Array], effects: Sequence[str]) -> Plot | 
     _, aside = used_rows(arrays, len(place))
     rows = ~aside & np.isfinite(place + before + after).all(-1)
     place, before, after = place[rows], before[rows], after[rows]
-    if len(place) < 2 or not np.abs(before).max() > 0:
+    if len(place) < 2 or not np.abs(before[:, 1:]).max() > 0:
+        # No gap, or one without a direction in space.
         return None
     extent = np.ptp(place, axis=0)
     plane = sorted(np.argsort(-extent, kind="stable")[:2].tolist())

@@ -24,7 +24,7 @@ from ccnn_torch.diagnosis.verdict.text import noise_text
 from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import SerialArm
+from ccnn_torch.mechanisms import Instrument, Mechanism, SerialArm
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.mechanisms.pose import CHANNELS
 from ccnn_torch.report.json_files import plain, write_json
@@ -138,7 +138,7 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
         "held_out": held,
         "set_aside": 1 - held,
     }
-    arrays |= _machine(situation, inside, keep)
+    arrays |= _machine(situation, inside, keep) if not isinstance(situation.mechanism, Instrument) else {}
     arrays |= {f"covariate.{name}": value for name, value in situation.covariates.items()}
     labels: dict[str, Any] = {}
     parts = [analysis.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
@@ -169,12 +169,22 @@ def _in_robot_frame(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Places `s x 3` and residuals `s x c0` in the robot's frame, wherever the measuring device stands."""
     arm = situation.mechanism
+    if isinstance(arm, Instrument):
+        # Readings have no direction in space: their size, in place of that of a position and of a rotation.
+        return situation.whole.platform[0], _sizes(arm, residual), _sizes(arm, remainder)
     if not isinstance(arm, SerialArm):
         return place, residual, remainder
     vectors = torch.stack([residual, remainder], 1).reshape(len(place), -1, 3)
     place, vectors = arm.in_own_base(place, vectors, situation.parameters)
     residual, remainder = vectors.reshape(len(place), 2, -1).unbind(1)
     return place, residual, remainder
+
+
+def _sizes(mechanism: Mechanism, values: Tensor) -> Tensor:
+    """Size of lengths and of angles of each row `s x c0`, each the first of three columns, `s x 3` or `s x 6`."""
+    angles = torch.tensor([c.unit == "rad" for c in mechanism.channels])
+    parts = [values[:, ~angles], *([values[:, angles]] if bool(angles.any()) else [])]
+    return torch.cat([torch.nn.functional.pad(part.norm(dim=-1, keepdim=True), (0, 2)) for part in parts], -1)
 
 
 def _machine(situation: Situation, place: Tensor, keep: Tensor) -> dict[str, Tensor]:

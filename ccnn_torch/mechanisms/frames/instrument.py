@@ -282,6 +282,10 @@ class Instrument(Seen):
         twin._only_twice = True
         return twin
 
+    def hand(self, joints: Tensor) -> Tensor:
+        """Where the nominal tool or platform is, `... x 3` [m]: of what is read nothing need be a place."""
+        return self.mechanism.frame(self.mechanism.forward_kinematics(joints))[0]
+
     def sample_given(self, count: int, generator: torch.Generator) -> Tensor:
         """Rows of any anchor, plane or second place, `count x p` [SI]; nothing is read yet."""
         columns = [self.home_pose[: self.compared].expand(count, -1)]
