@@ -26,6 +26,7 @@ from ccnn_torch.calibration.statistics import reach_block, share_unit, spread
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.engine import Failure, Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError, WriteError
+from ccnn_torch.mechanisms import Instrument
 from ccnn_torch.plugins import is_plugin
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import plain, read_json, write_json
