@@ -217,6 +217,12 @@ _WORDS = {
         "",
         "Speed limit and trajectory settings of {where}, and the supply voltage.",
     ),
+    "dead_band": Words(
+        "a dead band of the position control",
+        "dead band",
+        "The largest error that the drive does nothing about.",
+        "Dead band, deadzone or in-position window of the drive of {where}.",
+    ),
     "saturation": Words(
         "a limit of the motor's torque",
         "torque limit",

@@ -7,8 +7,9 @@ The motor's torque is the gain times (command less position). With everything di
 
 where u is the command after delay, speed limit and offset, and I the integral of u - q over the time: torques are then
 angles (N m per N m/rad), the inertia is in s^2, the viscous friction in s; a part of that which the drive makes is
-within the limit, too. With all of these 0 the position follows the command exactly: that axis is nominal where nothing
-is known. Behind a flexible joint, load and weight hang on a spring that pulls at the motor.
+within the limit, too. Within a dead band u - q counts as 0. With all of these 0 the position follows the command
+exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and weight hang on a spring that
+pulls at the motor.
 """
 
 from __future__ import annotations

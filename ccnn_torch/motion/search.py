@@ -6,7 +6,7 @@ All axes go side by side, each with its own sets: they share the simulated time 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -34,6 +34,9 @@ _KEPT = 6
 _LONG, _SHORT, _FEW = 8, 5, 3
 # Difference quotients, for numbers that begin at 0 [plausible sizes].
 _STEP = 0.1
+
+
+Members = tuple[int, ...]
 
 
 class Search(NamedTuple):
@@ -197,6 +200,11 @@ class _Pool:
         for _ in range(3):
             before = self.best()
             self.fit(self.screened(self.fewer([f.spec for f in before], _LONG)), _LONG)
+            # What does the same as a member needs the numbers that the others have beside that.
+            pairs = [(i, without(self.library, f.spec, k)) for i, f in enumerate(before) for k in range(len(f.members))]
+            less = fit_many(self.problem, self.whitening, pairs, 0, nuisance=self.nuisance)
+            bases = [[fit for (j, _), fit in zip(pairs, less, strict=True) if j == i] for i in range(self.axes)]
+            self.fit(self.screened(bases, 1, [{f.members} for f in before]), _LONG)
             if all(a.members == b.members for a, b in zip(before, self.best(), strict=True)):
                 return
 
@@ -225,8 +233,17 @@ class _Pool:
         self.fit([[s for s in own if s.members not in self.found[i]] for i, own in enumerate(less)], steps)
         return [[self.found[i][s.members] for s in own] for i, own in enumerate(less)]
 
-    def screened(self, bases: Sequence[Sequence[Fit]], most: int = _FITTED) -> list[list[Spec]]:
-        """For each base the new effects that promise most, by what a difference quotient of each explains."""
+    def screened(
+        self, bases: Sequence[Sequence[Fit]], most: int = _FITTED, old: Sequence[Container[Members]] | None = None
+    ) -> list[list[Spec]]:
+        """For each base the effects that promise most, by what a difference quotient of each explains.
+
+        Args:
+            bases: of each axis.
+            most: so many for each base.
+            old: sets of each axis that are not wanted; None = those that were fitted.
+        """
+        old = self.found if old is None else old
         wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
         for i, fit in [(i, fit) for i, own in enumerate(bases) for fit in own]:
             scores: dict[int, tuple[float, Variant]] = {}
@@ -235,7 +252,7 @@ class _Pool:
                     scores[variant.effect] = (score, variant)
             ranked = (v for _, v in sorted(scores.values(), key=lambda item: (-_level(item[0]), item[1].effect)))
             specs = (started(self.library, fit.spec, variant, i) for variant in ranked)
-            new = (spec for spec in specs if spec.members not in self.found[i])
+            new = (spec for spec in specs if spec.members not in old[i])
             for spec in islice(new, most):
                 wanted[i].setdefault(spec.members, spec)
         return [list(w.values()) for w in wanted]

@@ -36,6 +36,7 @@ KEYS: dict[str, str] = {
     "thermal": "change of coulomb for each kelvin above the coldest sample of the logs, as a share of it [1/K]",
     "delay": "from command to motor [s]",
     "offset": "of the position from the command [rad]",
+    "dead_band": "largest error that the drive does nothing about [rad]",
     "backlash": "whole width of the play [rad]",
     "backlash_loaded": "1 where the load moves freely within the play, and its weight presses it to one side [1]",
     "backlash_friction": "what friction of its own then brakes the load by [rad/s^2]",
@@ -50,7 +51,13 @@ TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravit
 """Parameters that are torques, which an axis has over the gain."""
 _SIGNED = ("delay", "offset", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
 _SAME = {
-    **{"integral": "integral", "derivative": "derivative", "delay": "delay", "offset": "offset"},
+    **{
+        "integral": "integral",
+        "derivative": "derivative",
+        "delay": "delay",
+        "offset": "offset",
+        "dead_band": "dead_band",
+    },
     **{"backlash": "play", "backlash_loaded": "play_loaded"},
     "backlash_friction": "play_friction",
     **{"load_friction": "load_friction", "stribeck_speed": "stribeck_speed", "cogging_order": "cogging_order"},

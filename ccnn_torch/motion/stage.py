@@ -40,6 +40,7 @@ ABSENT: dict[str, float] = {
     "slowness": 0.0,
     "delay": 0.0,
     "offset": 0.0,
+    "dead_band": 0.0,
     "supply": 0.0,
     "play": 0.0,
     "play_loaded": 0.0,
@@ -102,6 +103,7 @@ class Axis(NamedTuple):
     slack: Array
     drag: Array
     whole: Array
+    dead_band: Array
     delay: Array
     slowness: Array
     derivative: Array
@@ -125,6 +127,7 @@ class Has(NamedTuple):
     weak: Any
     slow: Any
     led: Any
+    dead: Any
     play: Any
     hung: Any
 
@@ -215,6 +218,7 @@ def axis_of(a: Mapping[str, Array]) -> Axis:
         slack=np.where(hung, 1 / np.maximum(stiffness, TINY), 0.0),
         drag=2 * a["flexible_damping"] * np.sqrt(np.maximum(a["flexibility"], 0)),
         whole=a["inertia"],
+        dead_band=a["dead_band"],
         delay=a["delay"],
         slowness=a["slowness"],
         derivative=a["derivative"],
@@ -231,7 +235,8 @@ def each_has(axis: Axis) -> Has:
     dry = (axis.coulomb != 0) | (axis.load_friction != 0) | (axis.stribeck != 0)
     return Has(
         *(axis.integral != 0, dry, axis.load_friction != 0, axis.stribeck != 0, axis.weight != 0, axis.wave != 0),
-        *(axis.flexibility > 0, axis.limit < 1 / TINY, axis.slowness > 0, axis.derivative != 0, axis.play > 0),
+        *(axis.flexibility > 0, axis.limit < 1 / TINY, axis.slowness > 0, axis.derivative != 0, axis.dead_band > 0),
+        axis.play > 0,
         (axis.play > 0) & (axis.play_loaded > 0),
     )
 
@@ -294,10 +299,21 @@ def _pulling(axis: Axis, has: Has, q: Array, push: Array) -> Array:
 
 
 @compilable
+def _error(axis: Axis, has: Has, error: Array) -> Array:
+    """What the drive makes of an error: nothing within its dead band."""
+    if has.dead:
+        return error - np.minimum(np.maximum(error, -axis.dead_band), axis.dead_band)
+    return error
+
+
+@compilable
 def _stage(axis: Axis, has: Has, fixed: _Fixed, state: State, u: Array, push: Array) -> State:
     """The state at the end of a stage."""
     h, limit, q, v, x, w, held = fixed.h, fixed.limit, state.q, state.v, state.x, state.w, state.held
-    motor = fixed.gain * (u - q) + held
+    motor, stiff = fixed.gain * _error(axis, has, u - q) + held, fixed.stiff
+    if has.dead:
+        # Within it nothing resists; an axis without a mass goes on as if something did.
+        stiff = pick((np.abs(u - q) < axis.dead_band) & (fixed.mass > 0), 0.0 * stiff, stiff)
     # What the gear carries beside the motor's torque.
     carried = _pulling(axis, has, q, push)
     against, loose = carried, q
@@ -313,19 +329,19 @@ def _stage(axis: Axis, has: Has, fixed: _Fixed, state: State, u: Array, push: Ar
         # Linearised, and no steeper than a stage can follow, the less so the more of a wave it passes without a mass:
         # else the last digit would decide where it goes.
         passed = np.square(axis.order * h * v)
-        steepest = _STEEP * (light - fixed.mass + fixed.stiff) / (1.0 + passed) + _SWINGING * fixed.mass
+        steepest = _STEEP * (light - fixed.mass + stiff) / (1.0 + passed) + _SWINGING * fixed.mass
         wave = np.minimum(axis.wave * axis.order, steepest / h)
         free = free - wave / axis.order * np.sin(axis.order * q + axis.phase)
         light = light + h * wave * np.cos(axis.order * q + axis.phase)
     friction = fixed.dry
     if has.stribeck:
         # It falls with the speed of the stage before, no steeper than that an axis without mass forgets it.
-        least = _STEEPEST * axis.stribeck / (_STEEP * (light - fixed.mass + fixed.stiff) + fixed.mass)
+        least = _STEEPEST * axis.stribeck / (_STEEP * (light - fixed.mass + stiff) + fixed.mass)
         friction = friction + axis.stribeck * np.exp(-np.square(v / np.maximum(axis.stribeck_speed, least)))
-    speed = _solved(axis, has, free, motor, friction, carried, light, fixed.stiff)
+    speed = _solved(axis, has, free, motor, friction, carried, light, stiff)
     if has.weak:
         # The part of the damping that the drive makes is within its limit.
-        torque = motor - (fixed.stiff + axis.drive_damping) * speed
+        torque = motor - (stiff + axis.drive_damping) * speed
         most = np.minimum(np.maximum(torque, -limit), limit)
         lighter = np.maximum(light - axis.drive_damping, TINY)
         weak = _solved(axis, has, free, most, friction, carried, lighter, 0.0 * most)
@@ -337,7 +353,7 @@ def _stage(axis: Axis, has: Has, fixed: _Fixed, state: State, u: Array, push: Ar
         x = x + h * w
     if has.integral:
         # Beyond the limit of the motor it stands still (anti-windup).
-        held = np.minimum(np.maximum(held + fixed.rate * h * (u - end), -limit), limit)
+        held = np.minimum(np.maximum(held + fixed.rate * h * _error(axis, has, u - end), -limit), limit)
     return State(end, speed, x, w, held)
 
 

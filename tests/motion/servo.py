@@ -38,19 +38,21 @@ def moved(
     integral: float = 0.0,
     derivative: float = 0.0,
     teeth: float = 0.0,
+    band: float = 0.0,
 ) -> Array:
     """Position of `INERTIA q'' = motor - (viscous - drive) q' - weight sin q - teeth sin 84 q - dry tanh(q' / 0.002)`,
     where the motor makes `GAIN (u - q + integral * integral of u - q + derivative * (u' - q')) - drive q'` within its
-    limit."""
+    limit, and within the band takes u - q for 0."""
     fast = np.gradient(asked, time)
 
     def rate(t: float, state: Array) -> list[float]:
         u = float(np.interp(t - delay, time, asked))
         lead = derivative * (float(np.interp(t - delay, time, fast)) - state[1])
-        motor = np.clip(GAIN * (u - state[0] + integral * state[2] + lead) - drive * state[1], -limit, limit)
+        error = u - state[0] - np.clip(u - state[0], -band, band)
+        motor = np.clip(GAIN * (error + integral * state[2] + lead) - drive * state[1], -limit, limit)
         torque = motor - (viscous - drive) * state[1] - weight * np.sin(state[0]) - dry * np.tanh(state[1] / 0.002)
         torque -= teeth * np.sin(84 * state[0])
-        return [float(state[1]), float(torque / INERTIA), float(u - state[0])]
+        return [float(state[1]), float(torque / INERTIA), float(error)]
 
     begin = [asked[0], 0.0, 0.0]
     found = solve_ivp(rate, (time[0], time[-1]), begin, "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)

@@ -40,12 +40,13 @@ OWN = {"inertia": INERTIA / GAIN, "viscous": VISCOUS / GAIN}
         {"integral": 3.0, "weight": 0.3},
         {"derivative": 0.02, "limit": 0.2},
         {"derivative": 0.03, "integral": 5.0, "dry": 0.02},
+        {"band": 0.03, "integral": 3.0},
     ],
 )
 def test_it_moves_as_its_equation_says(real: dict[str, float]) -> None:
     asked = command(0, TIME)
-    torques = {"weight": "gravity_sin", "dry": "coulomb", "drive": "drive_damping"}
-    mine = {torques.get(n, n): v / (GAIN if n in torques else 1) for n, v in real.items()}
+    torques = {"weight": "gravity_sin", "dry": "coulomb", "drive": "drive_damping", "band": "dead_band"}
+    mine = {torques.get(n, n): v / (GAIN if n in torques and n != "band" else 1) for n, v in real.items()}
     if "limit" in mine:
         mine["weakness"] = GAIN / mine.pop("limit")
     error = axis(TIME, asked, **OWN, **mine) - moved(TIME, asked, **real)

@@ -352,6 +352,15 @@ def test_a_gain_is_told_as_a_share_of_that_of_the_model(tmp_path: Path) -> None:
     assert findings(found.content)[0].text.startswith("wrong servo gain of joint 1: proportional gain -20")
 
 
+def test_a_dead_band_of_the_drive_is_named_and_is_no_friction(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.csv", (0, 2), 4.0, band=0.02)
+    tried = ["dead_band", "coulomb", "backlash", "viscous", "delay"]
+    found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), tried).content
+    assert found["verdict"]["effects"] == ["dead_band"] and found["verdict"]["probability"] > 0.9
+    numbers = next(e for e in found["effects"] if e["name"] == "dead_band")["parameters"]
+    assert numbers["q1 dead band"]["value"] == pytest.approx(0.02, rel=0.03)
+
+
 def test_a_derivative_gain_is_told_in_seconds_over_the_proportional_one(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.csv", (0, 1), 2.4, derivative=0.02)
     found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), ["servo_gain", "delay", "viscous"])

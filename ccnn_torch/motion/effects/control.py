@@ -67,6 +67,13 @@ SERVO_GAIN = MotionEffect("servo_gain", _gains, _either_gain)
 # Position and command differ by a constant.
 OFFSET = MotionEffect("offset", lambda axis: (Number("offset", "joint", 0.02, (add("offset"),), 0.0),))
 
+# Within it the drive does nothing; without an inertia dry friction does the same.
+DEAD_BAND = MotionEffect(
+    "dead_band",
+    lambda axis: (Number("dead band", "joint", 0.005, (add("dead_band"),), 1.0),),
+    missing=lambda axis: "" if axis.nominal.get("inertia") else "an inertia of the axis in the model",
+)
+
 # A torque that grows as long as the position is not the commanded one; plausible is an integral time of a second.
 INTEGRAL_ACTION = MotionEffect(
     "integral_action",
