@@ -232,14 +232,19 @@ def diagnose(
     """
     with loading():
         from ccnn_torch.diagnosis.job import run_diagnosis
-        from ccnn_torch.motion.job import run_motion
 
     logs = [str(log) for log in motion or []] or None
     given = {"records": records, "mechanism": mechanism, "seed": seed, "out": out, "network": network, "motion": logs}
     wanted = _diagnose_config(overrides, config, noise, effects, quiet, **given)
     if not wanted.motion and (wanted.exact or wanted.known):
         raise InputError("exact and known: tell how well the values of a motion's model are known; give --motion")
-    (run_motion if wanted.motion else run_diagnosis)(wanted, quiet, details)
+    if not wanted.motion:
+        run_diagnosis(wanted, quiet, details)
+        return
+    with loading():
+        from ccnn_torch.motion.job import run_motion
+
+    run_motion(wanted, quiet, details)
 
 
 def check(

@@ -68,14 +68,15 @@ def test_rows_that_are_refused_are_a_verdict_of_their_own(arm):
 
 def test_numbers_of_another_period_are_not_compared():
     def entry(period: float) -> dict[str, object]:
-        def number(value: float, sd: float | None) -> dict[str, float | None]:
-            return {"value": value, "sd": sd}
+        def frequency(value: float) -> dict[str, object]:
+            return {"value": value, "sd": 0.1, "searched": True}
 
+        wave = {"value": 1.0, "sd": 0.1}
         return {
-            "q1 sin": number(1.0, 0.1),
-            "q2 sin": number(1.0, 0.1),
-            "q1 frequency": number(7.0, None),
-            "q2 frequency": number(period, None),
+            "q1 sin": wave,
+            "q2 sin": wave,
+            "q1 frequency": frequency(7.0),
+            "q2 frequency": frequency(period),
         }
 
     assert replicates._same_shape("q1 sin", entry(3.0), entry(5.0))

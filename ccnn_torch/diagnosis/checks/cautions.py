@@ -315,15 +315,15 @@ def joint_scatter(analysis: Analysis, judgement: Judgement) -> Scatter | None:
     determinant, and ρ(a·r)² / (1 + ρ|a|²) the square that the joint takes (Sherman and Morrison); σ² is profiled out.
     Before that the channels are made alike and independent on average: noise of which one has more than another is no
     scatter of a joint, which changes with the pose. Only joints whose direction of approach was not recorded are asked,
-    and verdicts that say that nothing is left.
+    and whatever the verdict says that the rest follows: what scatters with a direction follows any driver a little.
     """
     situation, white = analysis.situation, analysis.whitening
     joints = [i for i in range(len(situation.mechanism.joints)) if f"direction{i + 1}" not in situation.covariates]
     columns, y = analysis.plain
-    # With gaps the channels are not alike, however they are mixed.
-    if not joints or y.shape[-1] < 2 or judgement.outside or white.seen is not None:
-        return None
     found = judgement.found
+    # With gaps the channels are not alike, however they are mixed.
+    if not joints or y.shape[-1] < 2 or white.seen is not None:
+        return None
     used = torch.cat([torch.arange(0), *(analysis.dictionary.groups[i] for i in found.members)])
     left = y - columns[..., used] @ torch.cat([y.new_zeros(0), *found.mean])
     alike = torch.linalg.cholesky_ex(left.mT @ left / len(left)).L
