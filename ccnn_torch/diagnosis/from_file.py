@@ -227,7 +227,8 @@ def not_held_notes(names: Sequence[str]) -> list[str]:
         return []
     return [
         f"{' and '.join(others)}: no effect of the library, and a compensator of effects=from:… (ccnn run) can hold "
-        "only those; let its network learn the gap (effects=none), or put it into the model that commands are made with"
+        "only those; identify the machine's parameters (geometry=identify), let its network learn the gap "
+        "(effects=none), or put it into the model that commands are made with"
     ]
 
 

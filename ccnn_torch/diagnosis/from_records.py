@@ -258,9 +258,9 @@ def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) ->
 def named_machine(said: Diagnosis) -> dict[str, Any] | None:
     """The entry `machine` of a diagnosis.json: effects and geometry that were named, fitted together to the rows.
 
-    Where geometry is among the names, all parameters are identified, six a link of an arm. None where a model can hold
-    nothing of the verdict: no effect, one that needs the rows in order, several tools, or a simulator. A machine whose
-    rows have a base frame for each group is that in its own base.
+    Where geometry or a parameter is among the names, all parameters are identified, six a link of an arm. None where a
+    model can hold nothing of the verdict: no effect, one that needs the rows in order, several tools, or a simulator.
+    A machine whose rows have a base frame for each group is that in its own base.
     """
     analysis, here = said.analysis, said.analysis.situation
     arm = here.mechanism
@@ -275,10 +275,10 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         whole, drift = Verdict(TRAINING_ROWS, here.gravity, named).of_machine()
         beside = [(a.effect, numbers) for a, (_, numbers) in zip(said.acting, named, strict=True) if _is_beside(a)]
         verdict = usable_verdict(whole, recorded)[0]
-        if verdict is None and drift is None:
+        identify = any(a.effect.kind == "parameters" for a in said.acting)
+        if verdict is None and drift is None and not identify:
             return None
         situation = on_fitted_frames(recorded)
-        identify = any(a.effect.kind == "parameters" for a in said.acting)
         if identify and isinstance(arm, SerialArm):
             situation = _in_link_frames(situation)
         known = [] if verdict is None else [k for k in verdict.on(recorded)[0] if k.effect.kind != "parameters"]

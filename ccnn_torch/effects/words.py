@@ -34,6 +34,12 @@ _WORDS = {
         "Mounting and lengths of {where}, of sliding axes their squareness, where a value is off by more than its "
         "tolerance.",
     ),
+    f"{PARAMETER}straightness": Words(
+        "guides that are not straight",
+        "guide that is not straight",
+        "Straightness is the bow of a guide over its travel: E, the direction of the bow, the axis that moves.",
+        "Guides of {where}: their alignment, their bed, and the load on them.",
+    ),
     "joint_offset": Words(
         "an offset of the joints",
         "zero offset",
@@ -254,7 +260,7 @@ _WORDS = {
 
 def words_of(name: str) -> Words:
     """The words of an effect by its name in verdicts; a user's own effect is called by its name."""
-    if name.startswith(PARAMETER):
+    if name.startswith(PARAMETER) and name not in _WORDS:
         own = name.removeprefix(PARAMETER)
         look = f"{own} in the simulator and as built."
         return Words(f"a wrong value of the parameter {own}", f"wrong value of {own}", "", look)

@@ -132,6 +132,30 @@ def test_straightness_is_found_beyond_a_known_table_and_commanded_away(tmp_path:
     assert told.startswith("0 of ")
 
 
+def test_a_bowed_guide_alone_is_told_and_commanded_away(tmp_path: Path, cli: Cli) -> None:
+    rng = np.random.default_rng(2)
+    joints = rng.uniform(0, [1, 0.8, 0.3], (120, 3))
+    bow = 30 * UM * (1 - (2 * joints[:, :1] - 1) ** 2) * [0, 1, 0]
+    seen = joints + bow + [2, 1, 0.5] + rng.normal(0, 1.5e-6, (120, 3))
+    columns = {f"q{k + 1}[m]": joints[:, k] for k in range(3)} | {f"{a}[m]": seen[:, k] for k, a in enumerate("xyz")}
+    write_table(tmp_path / "r.csv", columns)
+    (tmp_path / "g.yaml").write_text(template("gantry"))
+    about = ("--records", tmp_path / "r.csv", "--mechanism", tmp_path / "g.yaml", "--no-network", "--quiet")
+    code, _, told = cli("diagnose", *about, "--out", tmp_path / "why")
+    assert code == 0, told
+    said = json.loads((tmp_path / "why" / "diagnosis.json").read_text())
+    assert said["verdict"]["effects"] == ["parameter straightness"]
+    assert "Guide that is not straight: straightness EYX" in (tmp_path / "why" / "diagnosis.md").read_text()
+    fresh = rng.uniform(0.01, [0.99, 0.79, 0.29], (80, 3))
+    write_table(tmp_path / "t.csv", {f"q{k + 1}[m]": fresh[:, k] for k in range(3)})
+    code, _, told = cli("compensate", tmp_path / "why" / "diagnosis.json", tmp_path / "t.csv", tmp_path / "c.csv")
+    assert code == 0, told
+    with (tmp_path / "c.csv").open() as file:
+        command = np.array([[float(row[f"command_q{k}[m]"]) for k in (1, 2, 3)] for row in csv.DictReader(file)])
+    left, before = (q + 30 * UM * (1 - (2 * q[:, :1] - 1) ** 2) * [0, 1, 0] - fresh for q in (command, fresh))
+    assert _beside_a_motion(left, fresh) < 0.1 * _beside_a_motion(before, fresh)
+
+
 def _beside_a_motion(gap: Array, place: Array) -> float:
     """RMS over rows of what a shift and a small turn of the whole leave of gaps `s x 3` [m]."""
     eye = np.eye(3)
