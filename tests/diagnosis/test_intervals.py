@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
+from diagnosis._machines import reached_with, rows_of
 
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.effects import Acting, make_effect
-from tests.diagnosis._machines import reached_with, rows_of
 
 _Z95 = 1.96
 # Screws of the three slides: frequencies [rad/m] as shares of their grid, amplitudes [m] and phases of the wave and of
