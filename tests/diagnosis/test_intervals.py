@@ -9,8 +9,7 @@ from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.effects import Acting, make_effect
 
 _Z95 = 1.96
-# Screws of the three slides: frequencies [rad/m] as shares of their grid, amplitudes [m] and phases of the wave and of
-# its first harmonic.
+# Frequencies of the screws of three slides, as shares of their grids.
 _SCREWS = ((0.11, 0.27, 0.06), (0.24, 0.08, 0.19), (0.07, 0.31, 0.15), (0.29, 0.17, 0.02))
 
 
