@@ -175,7 +175,9 @@ def _of_an_arm(situation: Situation) -> list[Tensor]:
     assert isinstance(arm, SerialArm)
     points, axes = arm_axes(arm, situation.joints, arm.resolve(situation.parameters))
     place, rotation = situation.platform
-    assert rotation is not None
+    if rotation is None:
+        # Only what a changed file describes.
+        raise ValueError("an arm whose frame has no orientation")
     lever = place.unsqueeze(-2) - points
     wrench = situation.wrench.unsqueeze(-2)
     force = wrench[..., :3]
