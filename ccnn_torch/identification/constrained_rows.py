@@ -17,7 +17,7 @@ from ccnn_torch.identification.config import BesideConfig, ConstraintConfig, Ide
 from ccnn_torch.identification.measured import notes_of, split_records
 from ccnn_torch.identification.problems.constraints import tool_points
 from ccnn_torch.mechanisms import Instrument, Mechanism, as_measured, fit_unknown
-from ccnn_torch.mechanisms.frames.instrument import Part
+from ccnn_torch.mechanisms.frames.part import Part
 from ccnn_torch.mechanisms.frames.readings import Between, Dial, Reading, Wire
 from ccnn_torch.records import Records, Table, load_records, stack_columns
 from ccnn_torch.records.commanded import SECOND, read_joints

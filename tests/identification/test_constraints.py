@@ -21,7 +21,7 @@ from ccnn_torch.identification import (
     what_is_known,
 )
 from ccnn_torch.mechanisms import Instrument, SerialArm
-from ccnn_torch.mechanisms.frames.instrument import Part
+from ccnn_torch.mechanisms.frames.part import Part
 from ccnn_torch.mechanisms.frames.readings import Between, Dial, Reading, Wire
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 

@@ -20,7 +20,7 @@ SURE = 0.95
 """From this probability on a verdict is said as a fact, below it as the likeliest explanation."""
 
 LEAST = "at the least sure joint"
-"""Whose probability is told of several joints."""
+"""Of several joints the least probable verdict is that of the whole."""
 # Below this probability the rows determine no verdict: it is but the likeliest of many.
 _OPEN = 0.05
 # What is left beyond so many steps of an encoder is not its noise.

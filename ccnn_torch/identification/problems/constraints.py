@@ -19,7 +19,7 @@ from ccnn_torch.identification.problems.parameters import ParameterChoice, selec
 from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations
 from ccnn_torch.identification.problems.whitened import check_finite
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.mechanisms.frames.instrument import place_of
+from ccnn_torch.mechanisms.frames.part import place_of
 from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,106 +11,23 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.coordinates import Coordinate, Parameter
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form, fit_frames
+from ccnn_torch.mechanisms.frames.fit import fit_frames
 from ccnn_torch.mechanisms.frames.framed import Framed
+from ccnn_torch.mechanisms.frames.part import Part, all_read, has_orientation, place_with
 from ccnn_torch.mechanisms.frames.partial import Seen
-from ccnn_torch.mechanisms.frames.readings import READINGS, Place, Pose, Reading, make_reading
+from ccnn_torch.mechanisms.frames.readings import READINGS, Pose, make_reading
 from ccnn_torch.mechanisms.frames.set_ups import fit_set_ups
-from ccnn_torch.mechanisms.machines.links import compose
-from ccnn_torch.mechanisms.machines.serial import FRAME, SerialArm
+from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.pose import Frame, PoseError, frame_gap, frame_jacobian
-from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 # Rounds in which rows that are gross outliers are left out of the fit of what is unknown.
 _ROUNDS = 3
-# Plausible error of where something is on the hand or in space, after a closed form [m], [rad].
-_THERE = {"m": 0.02, "rad": 0.05}
-
-
-@dataclass(frozen=True)
-class Part:
-    """One of the instruments on a machine.
-
-    Attributes:
-        reading: what it reads.
-        link: number of the link that holds it, 0 = the base; None = the tool or platform.
-        name: in front of its columns and parameters, where there are two of a kind.
-        place: what is unknown of its place: `point` (of its own on the hand), `camera` (that, and the board's).
-    """
-
-    reading: Reading
-    link: int | None = None
-    name: str = ""
-    place: str = ""
-
-    def called(self, name: str) -> str:
-        """A column or parameter of it."""
-        return f"{self.name}.{name}" if self.name else name
-
-    @property
-    def frames(self) -> tuple[Parameter, ...]:
-        """Parameters of its place, behind those of its reading."""
-        kind = self.reading.kind
-        parts = {"": {}, "point": {f"{kind}point": 3}, "camera": {"mount": 6, "stand": 6}}[self.place]
-        return tuple(Parameter(f"{n}_{c}", u, 0.0, scale=_THERE[u]) for n, k in parts.items() for c, u in FRAME[:k])
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """All of its own."""
-        return tuple(replace(p, name=self.called(p.name)) for p in (*self.reading.parameters, *self.frames))
-
-    @property
-    def unknown(self) -> tuple[str, ...]:
-        """Beginnings of the names of those that are fitted first."""
-        own = dict.fromkeys(p.name.partition("_")[0] for p in self.frames)
-        return tuple(self.called(name) for name in (*self.reading.unknown, *own))
-
-    @property
-    def blind(self) -> tuple[str, ...]:
-        """Frames of an arm that it never shows."""
-        return self.reading.blind if self.link is None else ("tool",)
-
-    def __call__(self, there: Place, own: Tensor, given: Tensor) -> Tensor:
-        """What it reads, `... x c` [SI]; own: its parameters `... x m`."""
-        count = len(self.reading.parameters)
-        own, frames = own[..., :count], own[..., count:]
-        position, rotation = there.position, there.rotation
-        if self.place:
-            assert rotation is not None
-            mount = frames[..., :3]
-            position = position + (rotation @ mount[..., None])[..., 0]
-        if self.place == "camera":
-            assert rotation is not None
-            back = rotation_vector_to_matrix(frames[..., 9:12]).mT
-            rotation = back @ rotation @ rotation_vector_to_matrix(frames[..., 3:6])
-            position = (back @ (position - frames[..., 6:9])[..., None])[..., 0]
-        second = there.second
-        if second is not None and there.turned is not None and self.place:
-            second = second + (there.turned @ mount[..., None])[..., 0]
-        return self.reading(there._replace(position=position, rotation=rotation, second=second), own, given)
-
-    def start(self, there: Place, rows: Tensor, own: Tensor) -> Tensor:
-        """Its parameters near those that suit rows `s x (c + g)` in which it read."""
-        count = len(self.reading.parameters)
-        found = own.clone()
-        if self.place == "camera":
-            stands, poses = self.reading.frames(there.joints, rows, own[:count])
-            assert poses is not None and there.rotation is not None
-            first = torch.stack([(there.joints == q).all(-1).double().argmax() for q in stands])
-            pose = poses[:, :3], rotation_vector_to_matrix(poses[:, 3:])
-            held = there.rotation[first], there.position[first], pose, torch.zeros(6, dtype=own.dtype)
-            frames = best_closed_form(*held, torch.ones(len(poses), dtype=own.dtype), ROTATION_WEIGHT)
-            turn = rotation_vector_to_matrix(frames[3:6])
-            back = [-(turn.mT @ frames[:3]), -frames[3:6]]
-            found[count:] = torch.cat([frames[6:], *back])
-        found[:count] = self.reading.start(there, rows, own[:count])
-        return found
 
 
 class Instrument(Seen):
@@ -147,11 +63,11 @@ class Instrument(Seen):
                 )
         usual = torch.tensor([v for part in parts for v in part.reading.usual], dtype=torch.float64)
         start = torch.tensor([p.nominal for p in own], dtype=torch.float64)
-        turned = _has_orientation(mechanism)
+        turned = has_orientation(mechanism)
         blind = next((p.reading.kind for p in parts if (p.reading.turns or p.place) and not turned), None)
         if blind is not None:
             raise InputError(f"mechanism '{mechanism.name}' has no orientation, which a {blind} on it needs")
-        home = _all_read(parts, mechanism, mechanism.home_joints, mechanism.nominal, start, usual)
+        home = all_read(parts, mechanism, mechanism.home_joints, mechanism.nominal, start, usual)
         super().__init__(mechanism, [*read, *given], [*home.tolist(), *usual.tolist()], own)
         self.parts, self.known, self._only_twice = parts, False, False
 
@@ -242,7 +158,7 @@ class Instrument(Seen):
     ) -> Tensor:
         """What is read with these joints, and what is given by `guess` (home without), `... x p` [SI]."""
         values, count, given = self.resolve(parameters), len(self.mechanism.geometry), self.given(guess)
-        read = _all_read(self.parts, self.mechanism, joints, values[..., :count], values[..., count:], given)
+        read = all_read(self.parts, self.mechanism, joints, values[..., :count], values[..., count:], given)
         if self._only_twice:
             twice = [part.reading.twice for part in self.parts for _ in part.reading.read]
             read = torch.where(torch.tensor(twice), read, 0.0)
@@ -337,7 +253,7 @@ class Instrument(Seen):
 
         def read(twist: Tensor) -> Frame:
             every = self.parts, self.mechanism, joints, values[..., :count], values[..., count:], given, twist
-            return self.frame(_all_read(*every))
+            return self.frame(all_read(*every))
 
         return frame_jacobian(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype))
 
@@ -457,68 +373,8 @@ class Instrument(Seen):
         found = [start[:first]]
         for (part, q, mine), values in zip(each, own, strict=True):
             given = mine[:, len(part.reading.read) :]
-            found.append(part.start(_place(arm, part, q, start[:first], given), mine, values))
+            found.append(part.start(place_with(arm, part, q, start[:first], given), mine, values))
         return torch.cat(found)
-
-
-def _has_orientation(mechanism: Mechanism) -> bool:
-    """Whether the tool or platform has one, also where only its position is measured."""
-    return isinstance(mechanism, SerialArm) or mechanism.frame(mechanism.home_pose)[1] is not None
-
-
-def _all_read(
-    parts: Sequence[Part],
-    mechanism: Mechanism,
-    joints: Tensor,
-    values: Tensor,
-    own: Tensor,
-    given: Tensor,
-    twist: Tensor | None = None,
-) -> Tensor:
-    """What the instruments read, side by side, `... x c` [SI].
-
-    Args:
-        values: of the mechanism, `... x k`.
-        own: of the instruments, `... x m`.
-        given: what they were pointed at, `... x g`.
-        twist: shift and turn of what holds them, `... x 6`.
-    """
-    read, first, second = [], 0, 0
-    for part in parts:
-        ends = first + len(part.parameters), second + len(part.reading.given)
-        here = given[..., second : ends[1]]
-        there = _place(mechanism, part, joints, values, here)
-        if twist is not None:
-            turned = there.rotation
-            if turned is not None:
-                turned = rotation_vector_to_matrix(twist[..., 3:]) @ turned
-            there = there._replace(position=there.position + twist[..., :3], rotation=turned)
-        read.append(part(there, own[..., first : ends[0]], here))
-        first, second = ends
-    if len(read) == 1:
-        return read[0]
-    lead = leading_shape(*read)
-    return torch.cat([one.expand(*lead, -1) for one in read], -1)
-
-
-def _place(mechanism: Mechanism, part: Part, joints: Tensor, values: Tensor, given: Tensor) -> Place:
-    """Where what holds an instrument is, also with the joints that are given where its reading is of two places."""
-    there = place_of(mechanism, part.link, joints, values)
-    if not part.reading.twice:
-        return there
-    other = place_of(mechanism, part.link, given, values)
-    return there._replace(second=other.position, turned=other.rotation)
-
-
-def place_of(mechanism: Mechanism, link: int | None, joints: Tensor, values: Tensor) -> Place:
-    """Where the link is that holds an instrument, or the tool or platform, in the measuring frame."""
-    if link is not None and isinstance(mechanism, SerialArm):
-        base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3]
-        rotation, position = compose(base, mechanism.link_frames(joints, values)[link])
-        return Place(position, rotation, joints)
-    if isinstance(mechanism, SerialArm):
-        return Place(*mechanism.forward_frame(joints, values), joints)
-    return Place(*mechanism.frame(mechanism.forward_kinematics(joints, values)), joints)
 
 
 def fit_unknown(
