@@ -89,6 +89,8 @@ _PARENTHESES = re.compile(r"\s*(?P<name>[^()\[\]]*?)\s*\((?P<unit>[^()\[\]]*)\)\
 _HEADER = re.compile(r"\s*(?P<name>[^\[\]]*?)\s*\[(?P<unit>[^\[\]]*)\]\s*")
 _FACTOR = r"(?:[A-Za-zµμΩÅ_]+|%|°C?)(?:(?:\^|\*\*)-?[1-9]|⁻?[²³¹])?"
 _EXPRESSION = re.compile(rf"(?:1|{_FACTOR})(?:\s*[*/·⋅.\s]\s*{_FACTOR})*")
+# Signs of a product, which pint's versions read differently.
+_PRODUCT = re.compile("[·⋅.]")
 _REFUSED = {
     "Mm": "megametres; for millimetres write mm",
     "grad": "a 400th of a turn to some and a degree to others; write gon or deg",
@@ -278,7 +280,7 @@ def _lookup(unit: str) -> _Unit:
         raise _UnknownUnit(_not_known(unit))
     registry = _registry()
     try:
-        parsed = registry.parse_units(name)
+        parsed = registry.parse_units(_PRODUCT.sub("*", name))
     except (pint.UndefinedUnitError, pint.DefinitionSyntaxError, ValueError):
         raise _UnknownUnit(_not_known(unit)) from None
     zero, one = (registry.Quantity(value, parsed).to_base_units() for value in (0.0, 1.0))

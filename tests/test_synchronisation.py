@@ -58,7 +58,7 @@ def waits(call: Callable[[], object]) -> Counter[str]:
 
 def factors(call: Callable[[], object]) -> int:
     """Cholesky factorisations: one a trial."""
-    with profile(activities=[ProfilerActivity.CPU]) as seen:
+    with profile(activities=[ProfilerActivity.CPU], acc_events=True) as seen:
         call()
     return sum(event.name == "aten::linalg_cholesky_ex" for event in seen.events() or [])
 

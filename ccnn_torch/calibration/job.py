@@ -321,7 +321,7 @@ def _arrays(calibration: Calibration) -> RunArrays:
         map_place=None if simulation is None else place(simulation.pose[k]),
         map_before=None if simulation is None else _numpy(simulation.pose_errors(prepared.joints)[1].position[k]),
         map_after=None if systematic is None else _numpy(systematic.position[k]),
-        masks=tuple(mask.numpy() for mask in masks),
+        masks=tuple(mask.cpu().numpy() for mask in masks),
         weights=tuple(_numpy(weight) for weight in weights),
         axes=axes,
         labels={"method": method, "repeat": str(k), "mechanism": mechanism.name},

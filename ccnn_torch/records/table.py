@@ -121,7 +121,7 @@ class Table:
         if not unit and si_unit is not None:
             parse_header(name, self.path, si_unit)
         values = self.raw(name)
-        wrong = np.flatnonzero(~np.isfinite(values) & ~(self.blank(name) if gaps else False))
+        wrong = np.flatnonzero(~np.isfinite(values) & ~(self.blank(name) & gaps))
         if len(wrong):
             row = int(wrong[0])
             text = visible(self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}"), 40)
