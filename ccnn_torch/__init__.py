@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         calibrate as calibrate,
         diagnose_motion as diagnose_motion,
         identify as identify,
+        since as since,
         verify as verify,
     )
     from ccnn_torch.compensation import (

@@ -15,9 +15,11 @@ from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import Identification, identify as _identify
 from ccnn_torch.motion import MotionDiagnosis
 from ccnn_torch.motion.job import diagnosed
+from ccnn_torch.report.results.since import SinceResults
 from ccnn_torch.report.results.verify import VerifyResults
 from ccnn_torch.study.sweep import Row, load_sweep, run_sweep
 from ccnn_torch.verification.job import verify_model
+from ccnn_torch.verification.since import what_changed
 
 
 def calibrate(**keys: Any) -> Calibration:
@@ -127,3 +129,27 @@ def verify(
     """
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     return verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code).results
+
+
+def since(
+    model: str | Path,
+    records: Any,
+    mechanism: str | None = None,
+    allow_code: bool = False,
+    public_key: str | Path | None = None,
+    seed: int = 0,
+) -> SinceResults:
+    """What changed on a machine since its model was made, from ten new rows or so; nothing is written.
+
+    Args:
+        model, records, mechanism, allow_code, public_key: as for `verify`; the rows are of the uncompensated machine.
+        seed: of the poses that are proposed.
+
+    Returns:
+        The content of since.json; its `changed` lists what changed, with its numbers.
+
+    Raises:
+        InputError: the model or the rows cannot be used; the sentence says what to change.
+    """
+    loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
+    return what_changed(loaded, records, mechanism, allow_code=allow_code, seed=seed)

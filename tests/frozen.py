@@ -25,6 +25,7 @@ from ccnn_torch.report.results.base import Result
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
 from ccnn_torch.report.results.identified import IdentifiedResults
 from ccnn_torch.report.results.run import RunResults
+from ccnn_torch.report.results.since import SinceResults
 from ccnn_torch.report.results.suite import SuiteResults
 from ccnn_torch.report.results.verify import VerifyResults
 
@@ -34,6 +35,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "results": RunResults,
     "identified": IdentifiedResults,
     "diagnosis": DiagnosisResults,
+    "since": SinceResults,
     "suite": SuiteResults,
     "verify": VerifyResults,
 }

@@ -29,6 +29,9 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.run_folder.folder import NOTHING_WRITTEN, if_stopped
 
+# A first word that ends so is no config but RECORDS.
+_TABLES = (".csv", ".tsv", ".txt", ".xlsx", ".xlsm")
+
 if TYPE_CHECKING:
     from ccnn_torch.diagnosis.config import DiagnoseConfig
     from ccnn_torch.run_folder.resume import FolderJob
@@ -205,6 +208,10 @@ def diagnose(
     network: Annotated[
         bool | None, typer.Option(help="Estimate the further gain by a network; the same as network=….")
     ] = None,
+    since: Annotated[
+        Path | None,
+        typer.Option(metavar="MODEL", help="Tell what changed since this model was made, from a few new rows."),
+    ] = None,
     details: Annotated[bool, typer.Option("--details", help="Show all tables as well.")] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -213,8 +220,9 @@ def diagnose(
     The diagnosis comes first; then a network is trained on the residual of the effects, to estimate its further gain
     (seconds; --no-network omits that). The folder gets diagnosis.json, report.html and next_measurements.csv, the most
     informative poses to measure next. With --motion it is of time series: delay, gains, friction, play,
-    weights, limits. Keys: records, motion, columns, mechanism, out, mechanism_keys, covariates, noise,
-    exact, known, effects, gravity, network, seed.
+    weights, limits. With --since MODEL it is of a machine that has a model: ten new rows tell what changed, such as
+    the zero of one joint; the folder gets since.json and since.html. Keys: records, motion, columns, mechanism, out,
+    mechanism_keys, covariates, noise, exact, known, effects, gravity, network, seed.
 
     Examples:
 
@@ -229,7 +237,11 @@ def diagnose(
     ccnn diagnose --motion sine.csv --motion steps.csv --mechanism servo --out runs/axis
 
     ccnn diagnose --motion sine.csv --mechanism servo --out runs/axis exact=gain,time 'known={mass: 2 %}'
+
+    ccnn diagnose --since runs/ur10/model.safetensors new.csv --out runs/ur10_now
     """
+    if overrides and records is None and Path(overrides[0]).suffix.lower() in _TABLES:
+        records, overrides = overrides[0], overrides[1:]
     with loading():
         from ccnn_torch.diagnosis.job import run_diagnosis
 
@@ -238,6 +250,9 @@ def diagnose(
     wanted = _diagnose_config(overrides, config, noise, effects, quiet, **given)
     if not wanted.motion and (wanted.exact or wanted.known):
         raise InputError("exact and known: tell how well the values of a motion's model are known; give --motion")
+    if since is not None:
+        _diagnose_since(since, wanted, details, quiet)
+        return
     if not wanted.motion:
         run_diagnosis(wanted, quiet, details)
         return
@@ -245,6 +260,33 @@ def diagnose(
         from ccnn_torch.motion.job import run_motion
 
     run_motion(wanted, quiet, details)
+
+
+def _diagnose_since(model: Path, wanted: DiagnoseConfig, details: bool, quiet: bool) -> None:
+    with loading():
+        from ccnn_torch.compensation import load_compensation
+        from ccnn_torch.diagnosis.config import folder_of
+        from ccnn_torch.report.screen import say, say_place, stdout
+        from ccnn_torch.report.table import print_table
+        from ccnn_torch.verification.since import what_changed
+        from ccnn_torch.verification.since_page import since_tables, write_since
+
+    if wanted.records is None or wanted.motion:
+        raise InputError("--since MODEL: needs new rows of poses; give NEW.csv, or --records NEW.csv")
+    with if_stopped(NOTHING_WRITTEN):
+        folder, loaded = folder_of(wanted, "since.json"), load_compensation(model)
+        keys = {name: getattr(wanted, name) for name in ("columns", "joint_map", "mechanism_keys", "seed")}
+        results = what_changed(loaded, wanted.records, wanted.mechanism, **keys)
+        write_since(folder, results, loaded.joints)
+    if quiet:
+        return
+    say(results.text)
+    for told in results.changed:
+        say(told.look)
+    for table in since_tables(results, loaded.joints):
+        if details and table is not None:
+            print_table(table, stdout)
+    say_place(f"Everything is in {folder}; open {folder / 'since.html'}")
 
 
 def check(

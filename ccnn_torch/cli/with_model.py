@@ -248,6 +248,8 @@ def verify(
         for note in results.notes:
             typer.echo(note)
         typer.echo(f"Everything is in {out}; open {out / 'verify.html'}")
+        if not (results.kept or compensated):
+            typer.echo(f"What changed? ccnn diagnose --since {model} {wanted.records} --out {out}_since")
     if not results.kept:
         raise typer.Exit(1)
 

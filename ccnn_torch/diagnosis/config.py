@@ -85,8 +85,8 @@ class DiagnoseConfig(JobConfig):
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of folds and resampling")
 
 
-def folder_of(config: DiagnoseConfig) -> Path:
-    """The folder that a diagnosis writes; of an earlier diagnosis or check it is written over.
+def folder_of(config: DiagnoseConfig, *more: str) -> Path:
+    """The folder that a diagnosis writes; one with an earlier diagnosis, a check or a file of `more` is written over.
 
     Raises:
         InputError: none is named, or it holds other files.
@@ -94,5 +94,5 @@ def folder_of(config: DiagnoseConfig) -> Path:
     if config.out is None:
         raise InputError("name the folder to write with --out DIR")
     folder = Path(config.out)
-    check_own_folder(folder, ("diagnosis.json", "check.json"))
+    check_own_folder(folder, ("diagnosis.json", "check.json", *more))
     return folder

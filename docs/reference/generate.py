@@ -23,6 +23,7 @@ SCHEMAS = {
     "identified": "`identified.json` of `ccnn identify`",
     "diagnosis": "`diagnosis.json` of `ccnn diagnose`",
     "verify": "`verify.json` of `ccnn verify`",
+    "since": "`since.json` of `ccnn diagnose --since`",
     "suite": "`suite.json` of `ccnn suite`",
     "blind": "`blind.json` of `ccnn blind-check`",
 }

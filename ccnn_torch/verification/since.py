@@ -1,0 +1,444 @@
+"""What changed on a machine since its model was made, from a few new rows.
+
+What the model predicts is taken off, and what is left is explained by small changes of single parts: the zero of one
+joint, the numbers of one link or leg, the frames. Each is linear with a normal prior of its plausible size, the noise
+is what the model left of rows held out when it was made, and sets of changes are weighed by their marginal likelihood
+(`ccnn_torch.evidence`). A dozen rows suffice, since nothing else is fitted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.compensation import LoadedModel
+from ccnn_torch.diagnosis.candidates.atom import Atom, scaled_signature
+from ccnn_torch.diagnosis.residual.whitening import moving_channels, without_fitted
+from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.effects import (
+    Coefficient,
+    Situation,
+    default_gravity,
+    effect_names,
+    make_effect,
+    measured_channels,
+    missing_on,
+    pose_residual,
+)
+from ccnn_torch.effects.columns import inside
+from ccnn_torch.effects.constant import Frame
+from ccnn_torch.effects.words import words_of
+from ccnn_torch.errors import InputError
+from ccnn_torch.evidence.beam import search
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, covariance
+from ccnn_torch.evidence.judge import Explanation, Verdict, judge, marginal, posterior
+from ccnn_torch.evidence.priors import EFFECT
+from ccnn_torch.mechanisms import Mechanism, as_measured
+from ccnn_torch.mechanisms.frames.partial import completed
+from ccnn_torch.numerics.designs import Candidates
+from ccnn_torch.records import load_records
+from ccnn_torch.report.results.since import Change, ChangedNumber, Gap, NextPose, SinceResults, Told
+from ccnn_torch.verification.job import Motion, Rows, fit_motion, mapped_columns, nominal_mechanism, predict
+from ccnn_torch.verification.promise import configurations, promise_of
+
+_T = TypeVar("_T")
+FEWEST = 4
+"""Configurations from which a change is told."""
+# What is lost, moved or exchanged while a machine works; gear ratios, lengths and springs change ten times more rarely.
+_USUAL, _RARE = ("joint_offset", "frame", "tool"), math.log(0.1)
+# A device that is so far from where it stood was set up anew: first order does not hold, and nobody calls it an error.
+_FAR = {"m": 0.02, "rad": 0.02}
+# The frames of an arm by the effect that moves them.
+_FRAMES = {"frame": "base", "tool": "tool"}
+# What is left beside the verdict is more than the model promises where chance makes as much so rarely.
+_CHANCE = 0.01
+# A change would have been seen from so many standard deviations of its number: odds of about 20 to 1.
+_SEEN = 4.0
+# Poses that are proposed, of so many drawn; those that say less [nat] are not worth measuring.
+_WANTED, _DRAWN, _TELLING = 5, 400, 0.01
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """New rows about the model.
+
+    Attributes:
+        situation: `s` rows.
+        residual: measured less predicted pose, `s x c` [m, rad].
+        groups: configuration of each row, `s`.
+        scale: what a channel is multiplied by to be in units of the noise, a configuration counting once, `s x c`;
+            0 where it was not measured.
+        channels: which of the pose's channels, `c`.
+        noise_dof: weight of that noise, in values; 0 = the model promises none.
+        moved: how the measuring device stands elsewhere than when the model was made; no motion where it does not.
+        promise: RMS that the model promises of position [m] and rotation [rad].
+    """
+
+    situation: Situation
+    residual: Tensor
+    groups: Tensor
+    scale: Tensor
+    channels: Tensor
+    noise_dof: float
+    moved: Motion
+    promise: tuple[float | None, float | None]
+
+    @property
+    def lengths(self) -> Tensor:
+        """Which of the channels are lengths, `c` bool."""
+        every = self.situation.mechanism.channels
+        return torch.tensor([every[int(k)].unit == "m" for k in self.channels])
+
+    @property
+    def values(self) -> float:
+        """How many values count."""
+        count = int(self.groups.max()) + 1
+        return float(count * (self.scale > 0).sum() / len(self.groups))
+
+
+def what_changed(
+    model: LoadedModel,
+    records: Any,
+    mechanism: str | None = None,
+    *,
+    allow_code: bool = False,
+    columns: Mapping[str, str] | None = None,
+    joint_map: Mapping[str, str] | None = None,
+    mechanism_keys: Mapping[str, Any] | None = None,
+    seed: int = 0,
+) -> SinceResults:
+    """What changed since a model was made.
+
+    Args:
+        model: as `load_compensation` gives it.
+        records: new rows of the uncompensated machine, what `load_records` takes.
+        mechanism: name or file of the nominal machine; the one that the model describes when None.
+        allow_code: run the Python file that the model names for a user's own mechanism.
+        columns: header in the records -> ``name[unit]`` or ``ignore``; those of the model's run when None or empty.
+        joint_map: joint -> sum of columns; that of the model's run when None or empty.
+        mechanism_keys: keys of the mechanism's constructor.
+        seed: of the poses that are proposed.
+
+    Raises:
+        InputError: the rows lack a column, are not of this machine, or are too few.
+    """
+    machine = nominal_mechanism(model, mechanism, allow_code, mechanism_keys)
+    names = [c.name for c in model.covariates]
+    there, counted = mapped_columns(model, records, machine)
+    maps = {"columns": columns or there, "joint_map": joint_map or counted}
+    loaded = load_records(records, machine, names, learns=False, **maps)
+    rows = _rows_of(model, machine, loaded)
+    count = int(rows.groups.max()) + 1
+    if count < FEWEST:
+        raise InputError(
+            f"{loaded.path}: has {count_text(count, 'configuration')}; measure {FEWEST} or more, better ten, that are "
+            "spread over the workspace"
+        )
+    atoms = _atoms(rows.situation)
+    x = [a.columns[:, rows.channels] * rows.scale[..., None] for a in atoms]
+    y = rows.residual * rows.scale
+    notes = list(loaded.missing)
+    if bool(rows.moved.frame.any()):
+        # What a motion of the device does, too, is not seen any more.
+        frame = next(k for k, a in enumerate(atoms) if a.name == Frame.name)
+        first, *rest = without_fitted(x[frame], [y[..., None], *x])
+        y, x, atoms = first[..., 0], _but(rest, frame), _but(atoms, frame)
+        notes.append(
+            f"The measuring device stands elsewhere than when the model was made, by {rows.moved.words}: this was "
+            "taken off, and what looks like it is not seen in these rows."
+        )
+    dictionary, sets = search(atoms, x, y, rows.noise_dof, values=rows.values)
+    explanations = posterior([(1.0, [(_names(atoms, f), (), f.log_posterior, f) for f in sets])])
+    verdict = judge(explanations, explanations, lambda e: () if _is_more(rows, e.best) else None, of_classes=True)
+    results = SinceResults(
+        model=Path(model.path).name,
+        records=Path(loaded.path).name,
+        mechanism=rows.situation.mechanism.name,
+        rows=len(rows.groups),
+        configurations=count,
+        changed=[_told(rows, dictionary, verdict, i, k) for k, i in enumerate(verdict.chosen.best.members)],
+        probability=verdict.probability,
+        rest=verdict.outside,
+        position=_gap(rows, dictionary, verdict.chosen.best, "m"),
+        rotation=_gap(rows, dictionary, verdict.chosen.best, "rad") if bool((~rows.lengths).any()) else None,
+        changes=_changes(rows, dictionary, explanations),
+        next_measurements=_next(model, rows, dictionary, explanations, verdict, seed),
+        notes=notes,
+        text="",
+    )
+    results.text = since_text(results)
+    return results
+
+
+def _rows_of(model: LoadedModel, machine: Mechanism, loaded: Any) -> _Rows:
+    machine = as_measured(machine, loaded.pose_coordinates, loaded.path, loaded.pose)
+    found = predict(model, machine, loaded, False)
+    machine, joints = found.mechanism, found.joints
+    covariates = {c.name: loaded.covariates[:, i] for i, c in enumerate(loaded.covariate_coordinates)}
+    guess = completed(machine, joints, found.pose)
+    situation = Situation(machine, joints, covariates, default_gravity(machine), None, guess)
+    channels = moving_channels(situation)
+    moved = _moved(found)
+    residual = pose_residual(situation, found.undone(moved)) - pose_residual(situation, found.predicted)
+    residual = residual[:, channels]
+    seen = measured_channels(situation, found.pose)
+    known = torch.isfinite(residual) if seen is None else seen[:, channels] & torch.isfinite(residual)
+    groups = configurations(joints, machine.joints)
+    promise = promise_of(model) or {}
+    lengths = torch.tensor([machine.channels[int(k)].unit == "m" for k in channels])
+    rms = [None if (block := promise.get(kind)) is None else float(block["rms"]) for kind in ("position", "rotation")]
+    dof = [
+        2 * promise["configurations"] / promise[kind]["spread"]
+        for kind in ("position", "rotation")
+        if promise.get(kind)
+    ]
+    own = torch.where(known, residual, torch.nan).square().nanmean(0).sqrt()
+    sigma = torch.empty_like(own)
+    for mine, size in ((lengths, rms[0]), (~lengths, rms[1])):
+        sigma[mine] = own[mine] if size is None else size / math.sqrt(max(int(mine.sum()), 1))
+    share = torch.bincount(groups)[groups].to(sigma.dtype).rsqrt()
+    scale = torch.where(known, share[:, None] / sigma, 0.0)
+    is_known = all(size is not None for mine, size in ((lengths, rms[0]), (~lengths, rms[1])) if bool(mine.any()))
+    filled = torch.where(known, residual, 0.0)
+    return _Rows(situation, filled, groups, scale, channels, min(dof) if is_known else 0.0, moved, (rms[0], rms[1]))
+
+
+def _moved(found: Rows) -> Motion:
+    """The rigid motion of a measuring device that was set up anew; none where it is so small that it is a candidate."""
+    mechanism = found.mechanism
+    if not Motion.fits(mechanism) or int((~found.pose.isnan().any(-1)).sum()) < FEWEST:
+        return Motion.none()
+    motion = fit_motion(mechanism, found.predicted, found.pose)
+    shift, turn = float(motion.frame[:3].norm()), float(motion.frame[3:].norm())
+    return motion if shift > _FAR["m"] or turn > _FAR["rad"] else Motion.none()
+
+
+def _atoms(situation: Situation) -> list[Atom]:
+    """Changes of single parts: an effect's numbers joint by joint or leg by leg where each belongs to one."""
+    atoms = []
+    for name in effect_names(situation.mechanism):
+        effect = make_effect(name, situation.mechanism)
+        # A frame that was fitted when the model was made may have moved since.
+        fitted = _FRAMES.get(name) in getattr(inside(situation.mechanism), "unknown_frames", ())
+        if effect.ordered or (not fitted and missing_on(effect, situation)) or effect.shapes(situation):
+            continue
+        parts: dict[str, list[int]] = {}
+        coefficients = effect.coefficients(situation)
+        for k, one in enumerate(coefficients):
+            parts.setdefault(_part(one), []).append(k)
+        if "" in parts:
+            parts = {"": list(range(len(coefficients)))}
+        signature = scaled_signature(situation, effect, situation.joints[0, :0])
+        prior = EFFECT - math.log(max(len(parts), 1)) + (0.0 if name in _USUAL else _RARE)
+        for part, used in parts.items():
+            columns = torch.nan_to_num(signature[..., used])
+            if bool(columns.any()):
+                named = f"{name} {part}".strip()
+                atoms.append(Atom(named, effect, situation.joints[0, :0], columns, prior, tuple(used)))
+    return atoms
+
+
+def _but(values: Sequence[_T], left_out: int) -> list[_T]:
+    return [value for k, value in enumerate(values) if k != left_out]
+
+
+def _part(coefficient: Coefficient) -> str:
+    if coefficient.joint is not None:
+        return coefficient.joint
+    return "" if coefficient.leg is None else f"leg {coefficient.leg}"
+
+
+def _names(atoms: Sequence[Atom], found: FittedSet) -> frozenset[str]:
+    return frozenset(atoms[i].name for i in found.members)
+
+
+def _is_more(rows: _Rows, found: FittedSet) -> bool:
+    """Whether a set leaves more than the model promises."""
+    # Imported here: few commands need it.
+    from scipy.stats import f
+
+    free = max(rows.values - found.effective, 1.0)
+    return rows.noise_dof > 0 and float(f.sf(found.rss / free, free, rows.noise_dof)) < _CHANCE
+
+
+def _words(atom: Atom) -> str:
+    """The change in words, `zero offset of q3`."""
+    assert atom.effect is not None
+    short = words_of(atom.effect.name).short
+    part = atom.name.removeprefix(atom.effect.name).strip()
+    return f"{short} of {part}" if part else short
+
+
+def _told(rows: _Rows, dictionary: Dictionary, verdict: Verdict[FittedSet], index: int, place: int) -> Told:
+    atom, found = dictionary.atoms[index], verdict.chosen.best
+    assert isinstance(atom, Atom) and atom.effect is not None
+    begin = sum(len(mean) for mean in found.mean[:place])
+    sd = covariance(dictionary, found).diagonal().sqrt()[begin : begin + len(found.mean[place])]
+    numbers = [
+        ChangedNumber(name=c.name, unit=c.unit, value=float(m) * c.scale, sd=float(s) * c.scale)
+        for c, m, s in zip(atom.coefficients(rows.situation), found.mean[place], sd, strict=True)
+    ]
+    look = words_of(atom.effect.name).look.format(
+        where=atom.name.removeprefix(atom.effect.name).strip() or "the machine"
+    )
+    like = verdict.classes.get(atom.name, ())
+    instead = [_words(a) for name in like for a in dictionary.atoms if isinstance(a, Atom) and a.name == name]
+    return Told(name=atom.name, text=_words(atom), numbers=numbers, instead=instead, look=look)
+
+
+def _changes(rows: _Rows, dictionary: Dictionary, explanations: Sequence[Explanation[FittedSet]]) -> list[Change]:
+    found = []
+    for i, atom in enumerate(dictionary.atoms):
+        assert isinstance(atom, Atom)
+        first, *more = atom.coefficients(rows.situation)
+        size = dictionary.columns[..., dictionary.groups[i]].square().sum().sqrt()
+        found.append(
+            Change(
+                name=atom.name,
+                text=_words(atom),
+                probability=marginal(explanations, atom.name),
+                seen_from=None if more else _SEEN * first.scale / float(size),
+                unit=first.unit,
+            )
+        )
+    return sorted(found, key=lambda change: -change.probability)
+
+
+def _gap(rows: _Rows, dictionary: Dictionary, found: FittedSet, unit: str) -> Gap:
+    mine = rows.lengths if unit == "m" else ~rows.lengths
+    known = rows.scale > 0
+
+    def rms(left: Tensor) -> float:
+        squares = torch.where(known, left, 0.0)[:, mine].square().sum(-1)
+        return float(squares[known[:, mine].any(-1)].mean().sqrt())
+
+    after = rms(_left_out(rows, dictionary, found)) if found.members else None
+    promised = rows.promise[0 if unit == "m" else 1]
+    return Gap(unit="m" if unit == "m" else "rad", before=rms(rows.residual), after=after, promised=promised)
+
+
+def _left_out(rows: _Rows, dictionary: Dictionary, found: FittedSet) -> Tensor:
+    """What a set leaves of each configuration when it is fitted to the others, `s x c` [m, rad]."""
+    size = torch.cat([m.new_full((len(m),), s / 2).exp() for m, s in zip(found.mean, found.log_scale, strict=True)])
+    index = torch.cat([dictionary.groups[i] for i in found.members])
+    x, y = dictionary.columns[..., index] * size, dictionary.y
+    count = int(rows.groups.max()) + 1
+    normal = x.new_zeros(count, len(size), len(size)).index_add_(0, rows.groups, torch.einsum("sci,scj->sij", x, x))
+    along = x.new_zeros(count, len(size)).index_add_(0, rows.groups, torch.einsum("sci,sc->si", x, y))
+    inner = normal.sum(0) - normal + found.noise * torch.eye(len(size), dtype=x.dtype)
+    without = torch.linalg.solve(inner, along.sum(0) - along)
+    left = y - (x @ without[rows.groups][..., None])[..., 0]
+    return torch.where(rows.scale > 0, left / rows.scale.clamp_min(1e-300), 0.0)
+
+
+def _next(
+    model: LoadedModel,
+    rows: _Rows,
+    dictionary: Dictionary,
+    explanations: Sequence[Explanation[FittedSet]],
+    verdict: Verdict[FittedSet],
+    seed: int,
+) -> list[NextPose]:
+    """Poses that tell the verdict from its nearest rival, or make its numbers sharper where a pose tells nothing."""
+    first = verdict.chosen.best
+    rivals = [e for e in explanations if e.names != verdict.chosen.names]
+    if not first.members and (not rivals or verdict.probability > 1 - _TELLING):
+        return []
+    there = _poses(model, rows, seed)
+    noise = (1 / rows.scale.clamp_min(1e-300)).where(rows.scale > 0, torch.nan).nanmedian(0).values
+
+    def columns(found: FittedSet) -> Tensor:
+        parts = [there.jacobian[..., :0]]
+        for i in found.members:
+            atom = dictionary.atoms[i]
+            assert isinstance(atom, Atom) and atom.effect is not None and atom.used is not None
+            parts.append(scaled_signature(there, atom.effect, atom.shape)[..., list(atom.used)])
+        return torch.nan_to_num(torch.cat(parts, -1))[:, rows.channels] / noise[:, None]
+
+    own = covariance(dictionary, first)
+    if rivals:
+        other = rivals[0].best
+        both = torch.cat([columns(first), -columns(other)], -1)
+        spread = torch.block_diag(own, covariance(dictionary, other))  # type: ignore[no-untyped-call]
+        asked = Candidates.of(both, spread, torch.cat([both[0, 0, :0], *first.mean, *other.mean]))
+        found = _best(rows, there, asked, sorted(verdict.chosen.names ^ rivals[0].names))
+        if found or not first.members:
+            return found
+    return _best(rows, there, Candidates.of(columns(first), own), [])
+
+
+def _poses(model: LoadedModel, rows: _Rows, seed: int) -> Situation:
+    """Joints between the ends of the model's domain, or of the new rows; conditions as some row had them."""
+    here, generator = rows.situation, torch.Generator().manual_seed(seed)
+    domain = model.facts.get("domain", {}).get("inputs", {})
+    low, high = here.joints.amin(0), here.joints.amax(0)
+    for k, joint in enumerate(here.mechanism.joints):
+        if joint.name in domain:
+            low[k], high[k] = domain[joint.name]["low"], domain[joint.name]["high"]
+    share = torch.rand(_DRAWN, len(low), generator=generator, dtype=low.dtype)
+    row = torch.randint(len(here.joints), (_DRAWN,), generator=generator)
+    covariates = {name: values[row] for name, values in here.covariates.items()}
+    guess = None if here.guess is None else here.guess[row]
+    return replace(here, joints=low + (high - low) * share, covariates=covariates, guess=guess)
+
+
+def _best(rows: _Rows, there: Situation, asked: Candidates, separates: list[str]) -> list[NextPose]:
+    whole = torch.isfinite(there.jacobian).flatten(1).all(-1)
+
+    def gain() -> Tensor:
+        return 0.5 * (asked.information() if asked.difference is None else asked.divergence())
+
+    alone, taken = torch.nan_to_num(gain()), []
+    for _ in range(_WANTED):
+        worth = torch.where(whole, torch.nan_to_num(gain()), 0.0)
+        best = int(worth.argmax())
+        if float(worth[best]) < _TELLING:
+            break
+        taken.append(best)
+        whole = whole.clone()
+        whole[best] = False
+        asked.change(best, 1)
+    names = [joint.name for joint in rows.situation.mechanism.joints]
+    return [
+        NextPose(
+            joints=dict(zip(names, there.joints[k].tolist(), strict=True)), gain=float(alone[k]), separates=separates
+        )
+        for k in taken
+    ]
+
+
+def since_text(results: SinceResults) -> str:
+    """The verdict in two or three sentences."""
+    scale, unit = display_unit("m", results.position.before)
+    before, after, promised = (
+        None if v is None else f"{number_text(v / scale, 3)} {unit}"
+        for v in (results.position.before, results.position.after, results.position.promised)
+    )
+    rows = count_text(results.rows, "new row")
+    limit = "" if promised is None else f", the model promises {promised}"
+    if not results.changed:
+        said = "Something changed that none of the changes here explains"
+        said = said if results.rest else "Nothing changed that these rows show"
+        return f"{said}: on {rows} the position is off by {before} RMS{limit} (p {results.probability:.2f})."
+    what = " and ".join(_said(one) for one in results.changed)
+    more = " Beside this more is left than the model promises." if results.rest else ""
+    return (
+        f"Changed since the model was made: {what} (p {results.probability:.2f}). "
+        f"On {rows} the position is off by {before} RMS, and by {after} with this change, each row left out in turn"
+        f"{limit}.{more}"
+    )
+
+
+def _said(one: Told) -> str:
+    instead = f" (or {' or '.join(one.instead)})" if one.instead else ""
+    if len(one.numbers) > 1:
+        return f"{one.text}{instead}"
+    number = one.numbers[0]
+    scale, unit = display_unit(number.unit, abs(number.value))
+    return f"{one.text} by {number.value / scale:+.3g} ± {number.sd / scale:.2g} {unit}{instead}"
