@@ -24,7 +24,8 @@ Array = NDArray[np.float64]
 TRIPOD = Path(__file__).parent.parent / "checkpoints" / "tripod" / "model.safetensors"
 ARM = (
     "dof: 3\nconvention: standard Denavit-Hartenberg\nunits: {length: m, angle: rad}\n"
-    "a: [0.3, 0.25, 0.2]\nalpha: [0, 0, 0]\nd: [0, 0, 0]\ntheta: [0, 0, 0]\nbase_frame: unknown\ntool_frame: [0, 0, 0, 0, 0, 0]\n"
+    "a: [0.3, 0.25, 0.2]\nalpha: [0, 0, 0]\nd: [0, 0, 0]\ntheta: [0, 0, 0]\n"
+    "base_frame: unknown\ntool_frame: [0, 0, 0, 0, 0, 0]\n"
 )
 
 
