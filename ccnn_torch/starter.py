@@ -9,15 +9,20 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.mechanisms.frames.judge import coupled_count
 from ccnn_torch.mechanisms.registry import REGISTRY
+from ccnn_torch.motion.log import load_logs
 from ccnn_torch.records import DEFAULT_COVARIATES
 from ccnn_torch.records.commanded import GOAL
+from ccnn_torch.records.formats import form_of
 from ccnn_torch.records.headers import EULER_ANGLES
 from ccnn_torch.records.load import load_records, read_source
 from ccnn_torch.records.table import Table
@@ -228,19 +233,26 @@ _ORIENTATION = {"rx": "a rotation vector, as Universal Robots gives it", "kuka_a
 def starter_config(
     records: Path, out: Path, mechanism: str | None = None, units: str | None = None, ask: Ask | None = None
 ) -> tuple[str, bool]:
-    """Text of a commented config for records, and whether it can be run as it is.
+    """Text of a commented config for records or a log, and whether it can be run as it is; `command_of` runs it.
 
     Args:
-        records: the file.
+        records: the file or folder.
         out: path of the config; paths in it are relative to its folder.
         mechanism: name or file; guessed where one built-in mechanism has just these columns.
-        units: such as `mm,deg`, for columns without a unit.
+        units: such as `mm,deg`, for columns without a unit; of a log the unit of its joints.
         ask: asks the user a question; None without a terminal.
 
     Raises:
         InputError: the file cannot be read, has no joints or no pose, or columns lack units and `ask` is None.
     """
+    form = form_of(records)
+    if form is not None and form.motion:
+        return _motion_config(
+            records, out, mechanism, {} if units is None else {"units": units.rpartition(",")[2].strip()}
+        )
     table = read_source(records)
+    if {"time", "command1", "q1"} <= {*table.names}:
+        return _motion_config(records, out, mechanism, {})
     found = recognise(table)
     if not (found.joints or found.goals) or not found.pose:
         what = "measured pose (x, y, z …)"
@@ -265,6 +277,31 @@ def starter_config(
         *_other_lines(found, table),
     ]
     return "\n".join(lines) + "\n", name is not None
+
+
+def command_of(text: str, config: Path) -> str:
+    """The command line for a config that `starter_config` wrote."""
+    keys = parse_yaml(text, str(config))
+    if isinstance(keys, dict) and "motion" in keys:
+        return f"ccnn diagnose --config {config} --out runs/{config.stem}"
+    return f"ccnn run {config}"
+
+
+def _motion_config(records: Path, out: Path, mechanism: str | None, keys: Mapping[str, Any]) -> tuple[str, bool]:
+    """As `starter_config`, of a log of a machine in motion."""
+    logs = load_logs([records], keys=keys)
+    samples, notes = sum(len(log.time) for log in logs), [note for log in logs for note in log.notes]
+    servo = "each joint follows its command; keys of the drives, or an MJCF of the arm: docs/how_to/motion.md"
+    lines = [
+        _plain(
+            f"# Written by `ccnn new` for {records.name}, {count_text(len(logs), 'run')} of {samples} samples in all."
+        ),
+        *(_plain(f"# {note.removeprefix(f'{records}: ')}.") for note in notes),
+        f"motion: {json.dumps(_relative(records, out), ensure_ascii=False)}",
+        *([f"motion_keys: {json.dumps(dict(keys), ensure_ascii=False)}"] if keys else []),
+        *(_mechanism_lines(mechanism, "given", out) if mechanism else [f"mechanism: servo   # {servo}"]),
+    ]
+    return "\n".join(lines) + "\n", True
 
 
 def _machine(

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 def new(
     records: Annotated[
-        Path | None, typer.Argument(metavar="RECORDS.csv", help="Measured rows, with a line of headers.")
+        Path | None, typer.Argument(metavar="RECORDS", help="Measured rows with a line of headers, or a log.")
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE.yaml", help="The config or machine file to write.")] = None,
     mechanism: Mechanism = None,
@@ -46,7 +46,7 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing FILE.yaml.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a config for ccnn run from a table of measurements, or without one a machine file of a kind of machine.
+    """Write a config from a table of measurements or a log, or without one a machine file of a kind of machine.
 
     Joints may be called q1, J1, A1, joint_1, axis1 …; the position X, Y, Z; the orientation rx, ry, rz, qw to qz, A, B,
     C (KUKA) or W, P, R (Fanuc). What cannot be guessed is asked for on a terminal; elsewhere, and with
@@ -61,6 +61,8 @@ def new(
 
     ccnn new measured.csv --mechanism my_arm.yaml --units mm,deg --out robot.yaml
 
+    ccnn new lerobot_dataset --units deg --out arm.yaml      then ccnn diagnose --config arm.yaml
+
     ccnn new --mechanism delta_printer --out printer.yaml
     """
     if records is None:
@@ -73,7 +75,7 @@ def new(
         raise InputError(f"{out} is there already; name another file, or give --force to overwrite it")
     from ccnn_torch.files.write import write_whole
     from ccnn_torch.mechanisms.kinds.machine_file import template
-    from ccnn_torch.starter import starter_config
+    from ccnn_torch.starter import command_of, starter_config
 
     if records is None:
         write_whole(out, template(str(mechanism)).encode())
@@ -87,7 +89,7 @@ def new(
     if quiet:
         return
     typer.echo(f"{out} is written. Check it, then:")
-    typer.echo(f"ccnn run {out}" if ready else f"ccnn run {out} mechanism=FILL_IN")
+    typer.echo(f"{command_of(text, out)}{'' if ready else ' mechanism=FILL_IN'}")
 
 
 def run(
@@ -195,7 +197,7 @@ def diagnose(
     mechanism: Mechanism = None,
     motion: Annotated[
         list[Path] | None,
-        typer.Option(help="CSV of time, commands and positions of a machine in motion; a run, may be repeated."),
+        typer.Option(help="Log of a machine in motion: CSV, LeRobot data set, recording of ROS 2; may be repeated."),
     ] = None,
     out: Out = None,
     noise: Noise = None,

@@ -42,7 +42,9 @@ def diagnosed(config: DiagnoseConfig) -> MotionDiagnosis:
         raise InputError("mechanism: is missing; give --mechanism servo, a machine, or path/to/file.py:NAME")
     if config.records is not None:
         raise InputError("records and motion: a diagnosis is of poses or of a motion; give --records or --motion")
-    logs = load_logs([config.motion] if isinstance(config.motion, str) else config.motion, config.columns)
+    logs = load_logs(
+        [config.motion] if isinstance(config.motion, str) else config.motion, config.columns, config.motion_keys
+    )
     nominal = nominal_of(config.mechanism, config.mechanism_keys, logs[0].units)
     nominal = replace(nominal, known=shares_of(config.exact or (), config.known))
     if isinstance(config.noise, dict):

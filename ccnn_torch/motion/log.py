@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,12 +61,18 @@ class Log:
     notes: tuple[str, ...] = ()
 
 
-def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[str, str] | None = None) -> list[Log]:
+def load_logs(
+    sources: Sequence[str | Path | Frame | Table],
+    columns: Mapping[str, str] | None = None,
+    keys: Mapping[str, Any] | None = None,
+) -> list[Log]:
     """Read logs; every file is a run, or several where it has a column `run[1]`.
 
     Args:
-        sources: CSV files (or .xlsx, or data frames) with `time[s]`, `command1[rad]…`, `q1[rad]…` and optional columns.
+        sources: CSV files (or .xlsx, or data frames) with `time[s]`, `command1[rad]…`, `q1[rad]…` and optional columns;
+            or data sets of `ccnn_torch.records.formats`.
         columns: other headers -> ours, as for `read_table`.
+        keys: what is said of a data set, as for `read_table`.
 
     Raises:
         InputError: a column is missing or in a wrong unit, time does not increase, commands and positions do not fit
@@ -73,7 +80,7 @@ def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[st
     """
     if not sources:
         raise InputError("motion: name at least one log with --motion LOG.csv")
-    logs = [log for source in sources for log in _of_source(source, columns)]
+    logs = [log for source in sources for log in _of_source(source, columns, keys)]
     first = logs[0]
     for log in logs[1:]:
         if log.units != first.units:
@@ -85,11 +92,13 @@ def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[st
     return logs
 
 
-def _of_source(source: str | Path | Frame | Table, columns: Mapping[str, str] | None) -> list[Log]:
+def _of_source(
+    source: str | Path | Frame | Table, columns: Mapping[str, str] | None, keys: Mapping[str, Any] | None
+) -> list[Log]:
     if isinstance(source, Table):
         table = source
     else:
-        table = read_table(source, columns) if isinstance(source, str | Path) else read_frame(source, columns)
+        table = read_table(source, columns, keys) if isinstance(source, str | Path) else read_frame(source, columns)
     count = _joints(table)
     units = tuple(_unit(table, f"q{i}", f"command{i}") for i in range(1, count + 1))
     command, position = (
@@ -110,6 +119,7 @@ def _of_source(source: str | Path | Frame | Table, columns: Mapping[str, str] | 
         if rows[-1] - rows[0] >= len(rows):
             apart = f"{name}: its rows are not one after the other; they were gathered in their order"
             found[-1] = replace(found[-1], notes=(apart, *found[-1].notes))
+    found[0] = replace(found[0], notes=(*table.notes, *found[0].notes))
     return found
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import read_bytes
+from ccnn_torch.records.formats import Keys, read_form
 from ccnn_torch.records.headers import Header, is_number, read_header
 from ccnn_torch.records.table import Table, name_lines
 from ccnn_torch.units import split_header
@@ -105,8 +106,8 @@ class Frame(Protocol):
     def to_numpy(self) -> NDArray[Any]: ...
 
 
-def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Table:
-    """Read a CSV file, or the first sheet of an .xlsx workbook that has a header, with headers ``name[unit]``.
+def read_table(path: str | Path, columns: Mapping[str, str] | None = None, keys: Keys | None = None) -> Table:
+    """Read a CSV file, the first sheet of an .xlsx workbook that has a header, or what is in one of the `FORMS`.
 
     CSV: the separator is a comma, a semicolon or a tab, as the header has it; with the latter two a decimal comma is
     understood. The text is UTF-8, UTF-16 with a byte-order mark, or else Windows code page 1252, which is then
@@ -116,12 +117,14 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
     Args:
         path: the file.
         columns: header in the file -> ``name[unit]`` or ``ignore``.
+        keys: what is said of a form of `FORMS`, by key.
 
     Raises:
         InputError: the file cannot be read or is empty, a header is repeated, `columns` does not fit it, a title
             stands above it, or a row has another number of cells than the header.
     """
-    return next(read_parts(path, None, columns))
+    table = read_form(path, keys or {})
+    return next(read_parts(path, None, columns)) if table is None else mapped(table, columns or {})
 
 
 def read_parts(path: str | Path, rows: int | None, columns: Mapping[str, str] | None = None) -> Iterator[Table]:
