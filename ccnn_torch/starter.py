@@ -273,8 +273,8 @@ def starter_config(
         *_column_lines(columns, found, table),
         *(["# No joints: they are the nominal inverse kinematics of the commanded pose."] if found.goals else []),
         *_count_lines(columns, found, table, machine, records),
-        f"split: {split}   # {reason}",
-        *_other_lines(found, table),
+        *(form.config if form and form.config else [f"split: {split}   # {reason}"]),
+        *([] if form and form.config else _other_lines(found, table)),
     ]
     return "\n".join(lines) + "\n", name is not None
 
@@ -284,6 +284,8 @@ def command_of(text: str, config: Path) -> str:
     keys = parse_yaml(text, str(config))
     if isinstance(keys, dict) and "motion" in keys:
         return f"ccnn diagnose --config {config} --out runs/{config.stem}"
+    if isinstance(keys, dict) and "constraint" in keys:
+        return f"ccnn identify {config} out=runs/{config.stem}"
     return f"ccnn run {config}"
 
 

@@ -205,7 +205,7 @@ def test_without_pyarrow(tmp_path: Path, episodes: list[Episode], monkeypatch: p
 
 
 def test_a_folder_that_is_nothing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is a folder, and not a LeRobot data set, nor a recording of ROS 2"):
+    with pytest.raises(InputError, match="is a folder and no file, nor a LeRobot data set, nor a recording of ROS 2"):
         read_table(tmp_path)
     (tmp_path / "log.csv").write_text("time[s]\n1\n")
     with pytest.raises(InputError, match=r"'episodes' says nothing of .*log.csv, a table; leave it out"):

@@ -27,6 +27,7 @@ class Form(NamedTuple):
         recognised: whether a path is one, by the names of files.
         keys: what may be said of it.
         motion: whether it is a log of a machine in motion.
+        config: lines of a config for its rows, where they are no measured poses.
     """
 
     about: str
@@ -34,6 +35,7 @@ class Form(NamedTuple):
     recognised: Callable[[Path], bool]
     keys: Sequence[str] = ()
     motion: bool = False
+    config: Sequence[str] = ()
 
 
 def _has(pattern: str) -> Callable[[Path], bool]:
@@ -59,6 +61,15 @@ FORMS = (
         ("command", "state", "samples", "joints", "units"),
         motion=True,
     ),
+    Form(
+        "rows of a ball in sockets (hole_0.csv …)",
+        "sockets",
+        lambda path: _has("hole_[0-9].csv")(path) or _has("*/hole_[0-9].csv")(path),
+        config=(
+            "constraint: {kind: sockets, by: [placement]}   # tolerance: how far links may be from the nominal",
+            "split: {kind: random, test: 0.3}   # single rows are held out",
+        ),
+    ),
 )
 """All forms that are read beside tables."""
 
@@ -80,7 +91,8 @@ def read_form(path: str | Path, keys: Keys) -> Table | None:
     """
     form = form_of(path)
     if form is None and Path(path).is_dir():
-        raise InputError(f"{path}: is a folder, and not {', nor '.join(one.about for one in FORMS)}; give a file")
+        forms = ", nor ".join(form.about for form in FORMS)
+        raise InputError(f"{path}: is a folder and no file, nor {forms}; give a file")
     for key in keys:
         known = form.keys if form else ()
         if key not in known:
