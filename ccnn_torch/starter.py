@@ -44,6 +44,8 @@ _TURNS = (
 )
 # How others call the coordinates of a commanded pose, before or after the coordinate.
 _GOALS = ("goal", "commanded", "command", "cmd", "target", "soll")
+# How others call what was measured, before or after the coordinate; where it is no joint.
+_MEASURED = re.compile(r"(?:measured|meas|actual|act|ist)?(.+?)(?:measured|meas|actual|act|ist)?")
 # Mechanisms whose number of joints or frames does not follow from headers.
 _OPEN = ("serial", "framed", "partial", "instrument", "pair", "machine")
 
@@ -97,6 +99,7 @@ def recognise(table: Table) -> Recognised:
     wanted = _POSITION | {c.name for name in REGISTRY if name not in _OPEN for c in load_mechanism(name).pose}
     wanted -= {"rx", "ry", "rz"}
     by_plain = {plain: name for name, plain in reversed(folded.items()) if name not in meaning}
+    by_plain = {m[1]: name for plain, name in by_plain.items() if (m := _MEASURED.fullmatch(plain))} | by_plain
     meaning |= {by_plain[plain]: ours for ours in sorted(wanted) if (plain := ours.replace("_", "")) in by_plain}
     for theirs, ours in _TURNS:
         plains = [name.replace("_", "") for name in theirs]
@@ -334,16 +337,19 @@ def _columns(
 ) -> dict[str, str]:
     """Header in the file -> `name[unit]`, of every column that has a meaning."""
     bare = [name for name in found.meaning if not is_unit(table.units[name])]
-    if bare and units is None and ask is not None:
+    kinds = {name: found.unit_kind(found.meaning[name], machine) for name in bare}
+    pair = {"1": "1", **table.declared}
+    told = {*kinds.values()} <= {*pair}
+    if not told and units is None and ask is not None:
         units = ask(f"Units of lengths and angles (columns {', '.join(bare)} have none), e.g. mm,deg")
-    if bare and units is None:
+    if not told and units is None:
         raise InputError(
             f"{table.path}: {', '.join(bare)} {'has' if len(bare) == 1 else 'have'} no unit that is known; add the "
             "units of lengths and of angles: --units mm,deg"
         )
-    pair = unit_pair(units) if units is not None else {}
+    pair = unit_pair(units) if units is not None else pair
     return {
-        name: f"{ours}[{pair[found.unit_kind(ours, machine)] if name in bare else table.units[name]}]"
+        name: f"{ours}[{pair[kinds[name]] if name in bare else table.units[name]}]"
         for name, ours in found.meaning.items()
     }
 

@@ -139,7 +139,7 @@ def read_parts(path: str | Path, rows: int | None, columns: Mapping[str, str] | 
 
 
 def _csv_parts(file: str, rows: int | None, columns: Mapping[str, str] | None) -> Iterator[Table]:
-    text = _Text(file)
+    text = TextFile(file)
     filled = text.filled()
     # Comments, the header, and twenty lines below it.
     head: list[tuple[int, str]] = []
@@ -291,6 +291,18 @@ def _filled(cell: object) -> bool:
     return cell is not None and str(cell).strip() != ""
 
 
+def table_of(
+    file: str, names: Sequence[str], rows: Sequence[_Cells], lines: Sequence[int], comma: bool, notes: Sequence[str]
+) -> Table:
+    """A table of cells whose headers are ``name[unit]``; comma: whether it is the decimal separator.
+
+    Raises as `read_table`.
+    """
+    header, numbers = read_header(names, file), np.array(lines, dtype=np.int64)
+    values, bad = _read_cells(rows, header, file, numbers, decimal_comma=comma)
+    return _kept(file, header, values, numbers, bad, notes)
+
+
 def mapped(table: Table, columns: Mapping[str, str]) -> Table:
     """A table that was read without a map of columns, with its names and units as the map has them.
 
@@ -318,7 +330,7 @@ def _kept(
     return Table(file, header.units, values[:, header.kept], lines, cells, notes=tuple(notes), start=start)
 
 
-class _Text:
+class TextFile:
     """The lines of a file, of which only the bytes are held; `notes` says where its code page had to be guessed."""
 
     def __init__(self, file: str) -> None:
@@ -345,7 +357,7 @@ class _Text:
                 yield number, line.removesuffix("\n")
 
 
-def _has_decimal_commas(text: _Text, header: int, separator: str) -> bool:
+def _has_decimal_commas(text: TextFile, header: int, separator: str) -> bool:
     """Whether commas are decimal separators below a header: there are some, and no cell is a number with a point."""
     if not any("," in row for number, row in text.filled() if number > header):
         return False

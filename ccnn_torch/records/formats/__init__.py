@@ -18,6 +18,9 @@ Keys = Mapping[str, Any]
 """What is said of a form beside its path, by key."""
 
 
+_TEXTS = (".csv", ".txt", ".tsv", ".tab", ".asc", ".dat", ".prn", ".rpt", ".log", "")
+
+
 class Form(NamedTuple):
     """A form of a file or folder.
 
@@ -40,6 +43,14 @@ class Form(NamedTuple):
 
 def _has(pattern: str) -> Callable[[Path], bool]:
     return lambda path: path.is_dir() and next(path.glob(pattern), None) is not None
+
+
+def _is_export(path: Path) -> bool:
+    if path.suffix.lower() not in _TEXTS:
+        return False
+    from ccnn_torch.records.formats.export import recognised
+
+    return recognised(path)
 
 
 def _is_bag(path: Path) -> bool:
@@ -70,6 +81,7 @@ FORMS = (
             "split: {kind: random, test: 0.3}   # single rows are held out",
         ),
     ),
+    Form("a text export with its tables", "export", lambda path: _is_export(path)),
 )
 """All forms that are read beside tables."""
 
