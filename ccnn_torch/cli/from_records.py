@@ -63,6 +63,8 @@ def new(
 
     ccnn new lerobot_dataset --units deg --out arm.yaml      then ccnn diagnose --config arm.yaml
 
+    ccnn new printer.cfg --out printer.yaml      a delta printer of Klipper's, then ccnn identify printer.yaml
+
     ccnn new --mechanism delta_printer --out printer.yaml
     """
     if records is None:
@@ -71,12 +73,16 @@ def new(
         out = Path(f"{mechanism}.yaml") if out is None else out
     if out is None:
         raise InputError("--out: name the config to write, e.g. --out robot.yaml")
-    if out.exists() and not force:
-        raise InputError(f"{out} is there already; name another file, or give --force to overwrite it")
     from ccnn_torch.files.write import write_whole
     from ccnn_torch.mechanisms.kinds.machine_file import template
+    from ccnn_torch.records.formats.klipper import printer_files, read_printer
     from ccnn_torch.starter import command_of, starter_config
 
+    printer = None if records is None else read_printer(records)
+    files = {out: ""} if records is None or printer is None else printer_files(printer, records, out)
+    there = [] if force else [file for file in files if file.exists()]
+    if there:
+        raise InputError(f"{there[0]} is there already; name another file, or give --force to overwrite it")
     if records is None:
         write_whole(out, template(str(mechanism)).encode())
         if not quiet:
@@ -84,11 +90,13 @@ def new(
         return
     asks = not quiet and sys.stdin is not None and sys.stdin.isatty()
     ask = (lambda question: str(typer.prompt(question, default="", show_default=False))) if asks else None
-    text, ready = starter_config(records, out, mechanism, units, ask)
-    write_whole(out, text.encode())
+    text, ready = (files[out], True) if printer else starter_config(records, out, mechanism, units, ask)
+    for file, content in {**files, out: text}.items():
+        write_whole(file, content.encode())
     if quiet:
         return
-    typer.echo(f"{out} is written. Check it, then:")
+    one = len(files) == 1
+    typer.echo(f"{', '.join(map(str, files))} {'is' if one else 'are'} written. Check {'it' if one else 'them'}, then:")
     typer.echo(f"{command_of(text, out)}{'' if ready else ' mechanism=FILL_IN'}")
 
 
