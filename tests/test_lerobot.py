@@ -186,6 +186,7 @@ def test_a_stranger_comes_to_the_right_verdict(tmp_path: Path, cli: Cli, episode
     code, _, error = cli("diagnose", "--config", config, "--effects", effects, "--out", tmp_path / "out", "--quiet")
     assert code == 0, error
     found: Mapping[str, Any] = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert [joint["word"] for joint in found["joints"]] == ["shoulder_pan", "elbow_flex"]
     assert [sorted(joint["effects"]) for joint in found["joints"]] == [
         ["servo_gain"],
         ["backlash", "delay", "servo_gain"],

@@ -50,7 +50,10 @@ def diagnosed(config: DiagnoseConfig) -> MotionDiagnosis:
     if isinstance(config.noise, dict):
         raise InputError("noise: of a motion must be one standard deviation of the position, such as 1e-3 or 0.1mrad")
     noise = None if config.noise is None else size(config.noise, None, "noise")
-    return diagnose_motion(logs, nominal, config.effects, noise, config.seed)
+    found = diagnose_motion(logs, nominal, config.effects, noise, config.seed)
+    for own in found.content["joints"]:
+        own["word"] = logs[0].words.get(own["joint"], "")
+    return found
 
 
 def _complete(config: DiagnoseConfig, folder: Path, found: MotionDiagnosis, quiet: bool) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,7 @@ class Log:
         on: whether the drive was on and the sample is usable, `s`.
         cut: whether something is missing before the sample, so that it begins anew, `s`.
         notes: what was recognised and left out, one sentence each without a full stop.
+        words: what the source calls its joints, `q1` …; {} where it has no other names.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Log:
     on: NDArray[np.bool_]
     cut: NDArray[np.bool_]
     notes: tuple[str, ...] = ()
+    words: Mapping[str, str] = field(default_factory=dict)
 
 
 def load_logs(
@@ -119,7 +121,7 @@ def _of_source(
         if rows[-1] - rows[0] >= len(rows):
             apart = f"{name}: its rows are not one after the other; they were gathered in their order"
             found[-1] = replace(found[-1], notes=(apart, *found[-1].notes))
-    found[0] = replace(found[0], notes=(*table.notes, *found[0].notes))
+    found[0] = replace(found[0], notes=(*table.notes, *found[0].notes), words=table.words)
     return found
 
 

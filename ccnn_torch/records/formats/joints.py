@@ -115,4 +115,5 @@ def motion_table(
         np.stack([values for _, values in columns.values()], -1),
         np.arange(len(time), dtype=np.int64) + 1,
         notes=(f"{path}: {listed}", *(f"{path}: {note}" for note in notes)),
+        words={f"q{i + 1}": name for i, name in enumerate(joints.names)},
     )
