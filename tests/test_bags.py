@@ -172,6 +172,12 @@ def _cut(path: Path) -> None:
     file.write_bytes(file.read_bytes()[:3000])
 
 
+def _spoilt(path: Path) -> None:
+    """A message whose text does not end."""
+    file = path / "bag.mcap"
+    file.write_bytes(file.read_bytes().replace(b"shoulder\0", b"shoulder\1"))
+
+
 @pytest.mark.parametrize(
     ("said", "damage", "part"),
     [
@@ -180,6 +186,7 @@ def _cut(path: Path) -> None:
         ([], None, "it has no messages"),
         (played(), _cut, "is no whole recording of ROS 2"),
         (played(), lambda path: (path / "bag.mcap").write_bytes(b""), "is no whole recording of ROS 2"),
+        (played(), _spoilt, "is no whole recording of ROS 2: Missing string terminator"),
         (played(), lambda path: (path / "metadata.yaml").unlink(), "is no whole recording of ROS 2: Expected metadata"),
         ([*played()[:4], state(0.3, np.array([1e300, 1.0]))], None, "larger than anything that is measured"),
         ([*played()[:4], state(0.3, np.zeros(2), ["a", "b"])], None, "no joint has a position and a command"),
@@ -201,6 +208,12 @@ def test_a_config_for_a_recording(tmp_path: Path, cli: Cli) -> None:
     code, out, error = cli("new", path / "bag.mcap", "--out", tmp_path / "arm.yaml")
     assert code == 0, error
     assert "ccnn diagnose --config" in out and 'motion: "bag/bag.mcap"' in (tmp_path / "arm.yaml").read_text()
+
+
+def test_a_bag_of_the_first_ros_is_to_be_converted(tmp_path: Path) -> None:
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    with pytest.raises(InputError, match=r"is a bag of ROS 1; convert it with rosbags-convert --src old.bag"):
+        load_logs([tmp_path / "old.bag"])
 
 
 def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,7 +68,7 @@ FORMS = (
     Form(
         "a recording of ROS 2",
         "bags",
-        lambda path: path.suffix.lower() in (".mcap", ".db3") or _is_bag(path),
+        lambda path: path.suffix.lower() in (".mcap", ".db3", ".bag") or _is_bag(path),
         ("command", "state", "samples", "joints", "units"),
         motion=True,
     ),

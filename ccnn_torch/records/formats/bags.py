@@ -31,12 +31,12 @@ string[] joint_names
 trajectory_msgs/JointTrajectoryPoint reference
 trajectory_msgs/JointTrajectoryPoint feedback
 """
-# Measured states that are read where nothing is said: 100 s at 1 kHz.
-_SAMPLES = 100_000
-# What rosbags raises on a damaged file beside its own errors.
+# Measured states that are read where nothing is said: 8 minutes at 100 Hz.
+_SAMPLES = 50_000
+# What rosbags raises on a damaged file beside its own errors; a length in it may be larger than any memory.
 _DAMAGED = (
     *(AssertionError, AttributeError, EOFError, IndexError, KeyError, OSError, OverflowError, RuntimeError, TypeError),
-    *(ValueError, struct.error),
+    *(ValueError, MemoryError, struct.error),
 )
 
 
@@ -69,9 +69,11 @@ def read(path: Path, keys: Mapping[str, Any]) -> Table:
     Raises:
         InputError: it is damaged, has no commands or no positions, or several topics of them.
     """
+    if path.suffix.lower() == ".bag":
+        raise InputError(f"{path}: is a bag of ROS 1; convert it with rosbags-convert --src {path.name} --dst FOLDER")
     most = keys.get("samples", _SAMPLES)
     if isinstance(most, bool) or not isinstance(most, int) or most < 1:
-        raise InputError(f"motion_keys: samples: write how many, e.g. 100000, not {visible(str(most))}")
+        raise InputError(f"motion_keys: samples: write how many, e.g. 50000, not {visible(str(most))}")
     measured, commanded, notes = _messages(path, keys, most)
     if not measured or not commanded:
         lacking = "measured positions" if not measured else "commands"
@@ -111,6 +113,7 @@ def _messages(path: Path, keys: Mapping[str, Any], most: int) -> tuple[list[_Mes
     try:
         from apsw import Error as DatabaseError
         from rosbags.rosbag2 import Reader, ReaderError
+        from rosbags.serde import SerdeError
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
         raise InputError(
@@ -144,7 +147,7 @@ def _messages(path: Path, keys: Mapping[str, Any], most: int) -> tuple[list[_Mes
                     commanded.append(_Plan(one.names, one.stamp, recorded, np.zeros(1), one.position[None, None]))
                 if len(measured) >= most:
                     break
-    except (ReaderError, DatabaseError, *_DAMAGED) as reason:
+    except (ReaderError, SerdeError, DatabaseError, *_DAMAGED) as reason:
         said = visible((str(reason).splitlines() or [""])[0], 120)
         raise InputError(f"{path}: is no whole recording of ROS 2: {said or type(reason).__name__}") from None
     cut = [f"the first {most} positions were read; motion_keys={{samples: {10 * most}}} reads more"]
