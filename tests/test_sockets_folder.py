@@ -42,7 +42,9 @@ def test_a_folder_holds_the_rows_of_the_table(tmp_path: Path) -> None:
 
 def test_from_a_folder_to_an_identified_arm(tmp_path: Path, cli: Cli) -> None:
     config = tmp_path / "arm_sockets.yaml"
-    code, out, error = cli("new", folder(tmp_path / "arm"), "--mechanism", DATA / "sockets_arm.yaml", "--out", config)
+    code, out, error = cli(
+        "new", folder(tmp_path / "arm", 1), "--mechanism", DATA / "sockets_arm.yaml", "--out", config
+    )
     assert code == 0, error
     assert f"ccnn identify {config} out=runs/arm_sockets" in out and "Not used" not in config.read_text()
     code, _, error = cli("identify", config, f"out={tmp_path / 'run'}", "--quiet")

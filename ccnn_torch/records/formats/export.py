@@ -22,8 +22,8 @@ from ccnn_torch.records.read_table import SEPARATORS, TextFile, bare_header, hea
 from ccnn_torch.records.table import Table
 from ccnn_torch.units import si_unit_of, split_header
 
-# Bytes; exports of 100,000 rows are smaller.
-_LARGEST = 20_000_000
+# Bytes; exports of 50,000 rows are smaller.
+_LARGEST = 5_000_000
 _HEAD = 20
 # How cells are apart, what is most certain first: in columns of blanks a name may have one blank.
 _WAYS = ("\t", ";", ",", r"\s{2,}", r"\s+")
@@ -137,7 +137,7 @@ def _plain(lines: Sequence[tuple[int, str]]) -> bool:
         return True
     header, below = bare_header(head[place]), head[place + 1]
     separator = max(SEPARATORS, key=header.count)
-    cells, first = next(csv.reader([header], delimiter=separator)), next(csv.reader([below], delimiter=separator))
+    cells, first = _cells(header, separator), _cells(below, separator)
     if (
         len(cells) != len(first)
         or not any(map(is_number, first))
@@ -149,9 +149,10 @@ def _plain(lines: Sequence[tuple[int, str]]) -> bool:
 
 def _blocks(lines: Sequence[tuple[int, str]]) -> list[_Block]:
     """The tables, their cells apart in the way by which most rows fit their names; [] where there are too few."""
-    found = [_blocks_of([_Line(n, text, _cells(text, way)) for n, text in lines], way) for way in _WAYS]
+    ways = [way for way in _WAYS if way not in SEPARATORS or any(way in text for _, text in lines)]
+    found = [_blocks_of([_Line(n, text, _cells(text, way)) for n, text in lines], way) for way in ways]
     fitting = [sum(len(line.cells) == len(b.names) for b in own for line in b.rows) for own in found]
-    best = max(range(len(_WAYS)), key=lambda k: fitting[k])
+    best = max(range(len(ways)), key=lambda k: fitting[k])
     return found[best] if fitting[best] >= _FEWEST else []
 
 
