@@ -9,15 +9,20 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.mechanisms.frames.judge import coupled_count
 from ccnn_torch.mechanisms.registry import REGISTRY
+from ccnn_torch.motion.log import load_logs
 from ccnn_torch.records import DEFAULT_COVARIATES
 from ccnn_torch.records.commanded import GOAL
+from ccnn_torch.records.formats import form_of
 from ccnn_torch.records.headers import EULER_ANGLES
 from ccnn_torch.records.load import load_records, read_source
 from ccnn_torch.records.table import Table
@@ -39,6 +44,8 @@ _TURNS = (
 )
 # How others call the coordinates of a commanded pose, before or after the coordinate.
 _GOALS = ("goal", "commanded", "command", "cmd", "target", "soll")
+# How others call what was measured, before or after the coordinate; where it is no joint.
+_MEASURED = re.compile(r"(?:measured|meas|actual|act|ist)?(.+?)(?:measured|meas|actual|act|ist)?")
 # Mechanisms whose number of joints or frames does not follow from headers.
 _OPEN = ("serial", "framed", "partial", "instrument", "pair", "machine")
 
@@ -92,6 +99,7 @@ def recognise(table: Table) -> Recognised:
     wanted = _POSITION | {c.name for name in REGISTRY if name not in _OPEN for c in load_mechanism(name).pose}
     wanted -= {"rx", "ry", "rz"}
     by_plain = {plain: name for name, plain in reversed(folded.items()) if name not in meaning}
+    by_plain = {m[1]: name for plain, name in by_plain.items() if (m := _MEASURED.fullmatch(plain))} | by_plain
     meaning |= {by_plain[plain]: ours for ours in sorted(wanted) if (plain := ours.replace("_", "")) in by_plain}
     for theirs, ours in _TURNS:
         plains = [name.replace("_", "") for name in theirs]
@@ -228,19 +236,26 @@ _ORIENTATION = {"rx": "a rotation vector, as Universal Robots gives it", "kuka_a
 def starter_config(
     records: Path, out: Path, mechanism: str | None = None, units: str | None = None, ask: Ask | None = None
 ) -> tuple[str, bool]:
-    """Text of a commented config for records, and whether it can be run as it is.
+    """Text of a commented config for records or a log, and whether it can be run as it is; `command_of` runs it.
 
     Args:
-        records: the file.
+        records: the file or folder.
         out: path of the config; paths in it are relative to its folder.
         mechanism: name or file; guessed where one built-in mechanism has just these columns.
-        units: such as `mm,deg`, for columns without a unit.
+        units: such as `mm,deg`, for columns without a unit; of a log the unit of its joints.
         ask: asks the user a question; None without a terminal.
 
     Raises:
         InputError: the file cannot be read, has no joints or no pose, or columns lack units and `ask` is None.
     """
+    form = form_of(records)
+    if form is not None and form.motion:
+        return _motion_config(
+            records, out, mechanism, {} if units is None else {"units": units.rpartition(",")[2].strip()}
+        )
     table = read_source(records)
+    if {"time", "command1", "q1"} <= {*table.names}:
+        return _motion_config(records, out, mechanism, {})
     found = recognise(table)
     if not (found.joints or found.goals) or not found.pose:
         what = "measured pose (x, y, z …)"
@@ -261,10 +276,37 @@ def starter_config(
         *_column_lines(columns, found, table),
         *(["# No joints: they are the nominal inverse kinematics of the commanded pose."] if found.goals else []),
         *_count_lines(columns, found, table, machine, records),
-        f"split: {split}   # {reason}",
-        *_other_lines(found, table),
+        *(form.config if form and form.config else [f"split: {split}   # {reason}"]),
+        *([] if form and form.config else _other_lines(found, table)),
     ]
     return "\n".join(lines) + "\n", name is not None
+
+
+def command_of(text: str, config: Path) -> str:
+    """The command line for a config that `starter_config` wrote."""
+    keys = parse_yaml(text, str(config))
+    if isinstance(keys, dict) and "motion" in keys:
+        return f"ccnn diagnose --config {config} --out runs/{config.stem}"
+    if isinstance(keys, dict) and "constraint" in keys:
+        return f"ccnn identify {config} out=runs/{config.stem}"
+    return f"ccnn run {config}"
+
+
+def _motion_config(records: Path, out: Path, mechanism: str | None, keys: Mapping[str, Any]) -> tuple[str, bool]:
+    """As `starter_config`, of a log of a machine in motion."""
+    logs = load_logs([records], keys=keys)
+    samples, notes = sum(len(log.time) for log in logs), [note for log in logs for note in log.notes]
+    servo = "each joint follows its command; keys of the drives, or an MJCF of the arm: docs/how_to/motion.md"
+    lines = [
+        _plain(
+            f"# Written by `ccnn new` for {records.name}, {count_text(len(logs), 'run')} of {samples} samples in all."
+        ),
+        *(_plain(f"# {note.removeprefix(f'{records}: ')}.") for note in notes),
+        f"motion: {json.dumps(_relative(records, out), ensure_ascii=False)}",
+        *([f"motion_keys: {json.dumps(dict(keys), ensure_ascii=False)}"] if keys else []),
+        *(_mechanism_lines(mechanism, "given", out) if mechanism else [f"mechanism: servo   # {servo}"]),
+    ]
+    return "\n".join(lines) + "\n", True
 
 
 def _machine(
@@ -295,16 +337,19 @@ def _columns(
 ) -> dict[str, str]:
     """Header in the file -> `name[unit]`, of every column that has a meaning."""
     bare = [name for name in found.meaning if not is_unit(table.units[name])]
-    if bare and units is None and ask is not None:
+    kinds = {name: found.unit_kind(found.meaning[name], machine) for name in bare}
+    pair = {"1": "1", **table.declared}
+    told = {*kinds.values()} <= {*pair}
+    if not told and units is None and ask is not None:
         units = ask(f"Units of lengths and angles (columns {', '.join(bare)} have none), e.g. mm,deg")
-    if bare and units is None:
+    if not told and units is None:
         raise InputError(
             f"{table.path}: {', '.join(bare)} {'has' if len(bare) == 1 else 'have'} no unit that is known; add the "
             "units of lengths and of angles: --units mm,deg"
         )
-    pair = unit_pair(units) if units is not None else {}
+    pair = unit_pair(units) if units is not None else pair
     return {
-        name: f"{ours}[{pair[found.unit_kind(ours, machine)] if name in bare else table.units[name]}]"
+        name: f"{ours}[{pair[kinds[name]] if name in bare else table.units[name]}]"
         for name, ours in found.meaning.items()
     }
 

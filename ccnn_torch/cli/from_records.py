@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 def new(
     records: Annotated[
-        Path | None, typer.Argument(metavar="RECORDS.csv", help="Measured rows, with a line of headers.")
+        Path | None, typer.Argument(metavar="RECORDS", help="Measured rows with a line of headers, or a log.")
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE.yaml", help="The config or machine file to write.")] = None,
     mechanism: Mechanism = None,
@@ -49,7 +49,7 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing FILE.yaml.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a config for ccnn run from a table of measurements, or without one a machine file of a kind of machine.
+    """Write a config from a table of measurements or a log, or without one a machine file of a kind of machine.
 
     Joints may be called q1, J1, A1, joint_1, axis1 …; the position X, Y, Z; the orientation rx, ry, rz, qw to qz, A, B,
     C (KUKA) or W, P, R (Fanuc). What cannot be guessed is asked for on a terminal; elsewhere, and with
@@ -64,6 +64,10 @@ def new(
 
     ccnn new measured.csv --mechanism my_arm.yaml --units mm,deg --out robot.yaml
 
+    ccnn new lerobot_dataset --units deg --out arm.yaml      then ccnn diagnose --config arm.yaml
+
+    ccnn new printer.cfg --out printer.yaml      a delta printer of Klipper's, then ccnn identify printer.yaml
+
     ccnn new --mechanism delta_printer --out printer.yaml
     """
     if records is None:
@@ -72,12 +76,16 @@ def new(
         out = Path(f"{mechanism}.yaml") if out is None else out
     if out is None:
         raise InputError("--out: name the config to write, e.g. --out robot.yaml")
-    if out.exists() and not force:
-        raise InputError(f"{out} is there already; name another file, or give --force to overwrite it")
     from ccnn_torch.files.write import write_whole
     from ccnn_torch.mechanisms.kinds.machine_file import template
-    from ccnn_torch.starter import starter_config
+    from ccnn_torch.records.formats.klipper import printer_files, read_printer
+    from ccnn_torch.starter import command_of, starter_config
 
+    printer = None if records is None else read_printer(records)
+    files = {out: ""} if records is None or printer is None else printer_files(printer, records, out)
+    there = [] if force else [file for file in files if file.exists()]
+    if there:
+        raise InputError(f"{there[0]} is there already; name another file, or give --force to overwrite it")
     if records is None:
         write_whole(out, template(str(mechanism)).encode())
         if not quiet:
@@ -85,12 +93,14 @@ def new(
         return
     asks = not quiet and sys.stdin is not None and sys.stdin.isatty()
     ask = (lambda question: str(typer.prompt(question, default="", show_default=False))) if asks else None
-    text, ready = starter_config(records, out, mechanism, units, ask)
-    write_whole(out, text.encode())
+    text, ready = (files[out], True) if printer else starter_config(records, out, mechanism, units, ask)
+    for file, content in {**files, out: text}.items():
+        write_whole(file, content.encode())
     if quiet:
         return
-    typer.echo(f"{out} is written. Check it, then:")
-    typer.echo(f"ccnn run {out}" if ready else f"ccnn run {out} mechanism=FILL_IN")
+    one = len(files) == 1
+    typer.echo(f"{', '.join(map(str, files))} {'is' if one else 'are'} written. Check {'it' if one else 'them'}, then:")
+    typer.echo(f"{command_of(text, out)}{'' if ready else ' mechanism=FILL_IN'}")
 
 
 def run(
@@ -198,7 +208,7 @@ def diagnose(
     mechanism: Mechanism = None,
     motion: Annotated[
         list[Path] | None,
-        typer.Option(help="CSV of time, commands and positions of a machine in motion; a run, may be repeated."),
+        typer.Option(help="Log of a machine in motion: CSV, LeRobot data set, recording of ROS 2; may be repeated."),
     ] = None,
     out: Out = None,
     noise: Noise = None,

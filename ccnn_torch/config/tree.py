@@ -18,6 +18,9 @@ from ccnn_torch.files.yaml_file import check_values, dump_yaml, parse_yaml, read
 _MACHINES = ("mechanism", "first", "second")
 _TEXT = ("name", "out", "records", "transfer", "mechanism")
 
+# Files and folders with measured rows.
+_FILES = ("records", "motion")
+
 # Prefix of a file in `effects`.
 _FROM = "from:"
 
@@ -86,7 +89,7 @@ def _resolve(key: str, value: Any, folder: Path) -> Any:
 
 def _changed(key: str, value: Any, change: Callable[[str], str]) -> Any:
     """The value of a key with each path in it changed."""
-    if key == "records":
+    if key in _FILES:
         return _changed_files(value, change)
     if key == "constraint" and isinstance(value, dict) and isinstance(value.get("beside"), list):
         beside = [
@@ -96,6 +99,8 @@ def _changed(key: str, value: Any, change: Callable[[str], str]) -> Any:
         return {**value, "beside": beside}
     if key == "split" and isinstance(value, dict) and "test" in value:
         return {**value, "test": _changed("split.test", value["test"], change)}
+    if key == "motion_keys" and isinstance(value, dict):
+        return {k: change(v) if k == "calibration" and isinstance(v, str) else v for k, v in value.items()}
     if key == "mechanism_keys" and isinstance(value, dict):
         # Of a machine that holds others: framed, partial, instrument, pair.
         return {k: _changed("mechanism", v, change) if k in _MACHINES else v for k, v in value.items()}

@@ -42,7 +42,13 @@ class DiagnoseConfig(JobConfig):
     )
     motion: Files | None = Field(
         default=None,
-        description="CSV of the logs of a machine in motion, each a run; the same as --motion; in the place of records",
+        description="logs of a machine in motion: CSV files (each a run), LeRobot data sets, recordings of ROS 2; the "
+        "same as --motion; in the place of records",
+    )
+    motion_keys: dict[str, Any] = Field(
+        default={},
+        description="of logs that are no tables: joints, units; of a LeRobot data set episodes, calibration; of a "
+        "recording of ROS 2 the topics command and state, and samples",
     )
     columns: Columns
     joint_map: JointMap

@@ -42,13 +42,18 @@ def diagnosed(config: DiagnoseConfig) -> MotionDiagnosis:
         raise InputError("mechanism: is missing; give --mechanism servo, a machine, or path/to/file.py:NAME")
     if config.records is not None:
         raise InputError("records and motion: a diagnosis is of poses or of a motion; give --records or --motion")
-    logs = load_logs([config.motion] if isinstance(config.motion, str) else config.motion, config.columns)
+    logs = load_logs(
+        [config.motion] if isinstance(config.motion, str) else config.motion, config.columns, config.motion_keys
+    )
     nominal = nominal_of(config.mechanism, config.mechanism_keys, logs[0].units)
     nominal = replace(nominal, known=shares_of(config.exact or (), config.known))
     if isinstance(config.noise, dict):
         raise InputError("noise: of a motion must be one standard deviation of the position, such as 1e-3 or 0.1mrad")
     noise = None if config.noise is None else size(config.noise, None, "noise")
-    return diagnose_motion(logs, nominal, config.effects, noise, config.seed)
+    found = diagnose_motion(logs, nominal, config.effects, noise, config.seed)
+    for own in found.content["joints"]:
+        own["word"] = logs[0].words.get(own["joint"], "")
+    return found
 
 
 def _complete(config: DiagnoseConfig, folder: Path, found: MotionDiagnosis, quiet: bool) -> list[str]:

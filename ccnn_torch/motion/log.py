@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,7 @@ class Log:
         on: whether the drive was on and the sample is usable, `s`.
         cut: whether something is missing before the sample, so that it begins anew, `s`.
         notes: what was recognised and left out, one sentence each without a full stop.
+        words: what the source calls its joints, `q1` …; {} where it has no other names.
     """
 
     name: str
@@ -58,14 +60,21 @@ class Log:
     on: NDArray[np.bool_]
     cut: NDArray[np.bool_]
     notes: tuple[str, ...] = ()
+    words: Mapping[str, str] = field(default_factory=dict)
 
 
-def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[str, str] | None = None) -> list[Log]:
+def load_logs(
+    sources: Sequence[str | Path | Frame | Table],
+    columns: Mapping[str, str] | None = None,
+    keys: Mapping[str, Any] | None = None,
+) -> list[Log]:
     """Read logs; every file is a run, or several where it has a column `run[1]`.
 
     Args:
-        sources: CSV files (or .xlsx, or data frames) with `time[s]`, `command1[rad]…`, `q1[rad]…` and optional columns.
+        sources: CSV files (or .xlsx, or data frames) with `time[s]`, `command1[rad]…`, `q1[rad]…` and optional columns;
+            or data sets of `ccnn_torch.records.formats`.
         columns: other headers -> ours, as for `read_table`.
+        keys: what is said of a data set, as for `read_table`.
 
     Raises:
         InputError: a column is missing or in a wrong unit, time does not increase, commands and positions do not fit
@@ -73,7 +82,7 @@ def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[st
     """
     if not sources:
         raise InputError("motion: name at least one log with --motion LOG.csv")
-    logs = [log for source in sources for log in _of_source(source, columns)]
+    logs = [log for source in sources for log in _of_source(source, columns, keys)]
     first = logs[0]
     for log in logs[1:]:
         if log.units != first.units:
@@ -85,11 +94,13 @@ def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[st
     return logs
 
 
-def _of_source(source: str | Path | Frame | Table, columns: Mapping[str, str] | None) -> list[Log]:
+def _of_source(
+    source: str | Path | Frame | Table, columns: Mapping[str, str] | None, keys: Mapping[str, Any] | None
+) -> list[Log]:
     if isinstance(source, Table):
         table = source
     else:
-        table = read_table(source, columns) if isinstance(source, str | Path) else read_frame(source, columns)
+        table = read_table(source, columns, keys) if isinstance(source, str | Path) else read_frame(source, columns)
     count = _joints(table)
     units = tuple(_unit(table, f"q{i}", f"command{i}") for i in range(1, count + 1))
     command, position = (
@@ -110,6 +121,7 @@ def _of_source(source: str | Path | Frame | Table, columns: Mapping[str, str] | 
         if rows[-1] - rows[0] >= len(rows):
             apart = f"{name}: its rows are not one after the other; they were gathered in their order"
             found[-1] = replace(found[-1], notes=(apart, *found[-1].notes))
+    found[0] = replace(found[0], notes=(*table.notes, *found[0].notes), words=table.words)
     return found
 
 

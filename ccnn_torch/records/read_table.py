@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import read_bytes
+from ccnn_torch.records.formats import Keys, read_form
 from ccnn_torch.records.headers import Header, is_number, read_header
 from ccnn_torch.records.table import Table, name_lines
 from ccnn_torch.units import split_header
@@ -105,8 +106,8 @@ class Frame(Protocol):
     def to_numpy(self) -> NDArray[Any]: ...
 
 
-def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Table:
-    """Read a CSV file, or the first sheet of an .xlsx workbook that has a header, with headers ``name[unit]``.
+def read_table(path: str | Path, columns: Mapping[str, str] | None = None, keys: Keys | None = None) -> Table:
+    """Read a CSV file, the first sheet of an .xlsx workbook that has a header, or what is in one of the `FORMS`.
 
     CSV: the separator is a comma, a semicolon or a tab, as the header has it; with the latter two a decimal comma is
     understood. The text is UTF-8, UTF-16 with a byte-order mark, or else Windows code page 1252, which is then
@@ -116,12 +117,14 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
     Args:
         path: the file.
         columns: header in the file -> ``name[unit]`` or ``ignore``.
+        keys: what is said of a form of `FORMS`, by key.
 
     Raises:
         InputError: the file cannot be read or is empty, a header is repeated, `columns` does not fit it, a title
             stands above it, or a row has another number of cells than the header.
     """
-    return next(read_parts(path, None, columns))
+    table = read_form(path, keys or {})
+    return next(read_parts(path, None, columns)) if table is None else mapped(table, columns or {})
 
 
 def read_parts(path: str | Path, rows: int | None, columns: Mapping[str, str] | None = None) -> Iterator[Table]:
@@ -136,7 +139,7 @@ def read_parts(path: str | Path, rows: int | None, columns: Mapping[str, str] | 
 
 
 def _csv_parts(file: str, rows: int | None, columns: Mapping[str, str] | None) -> Iterator[Table]:
-    text = _Text(file)
+    text = TextFile(file)
     filled = text.filled()
     # Comments, the header, and twenty lines below it.
     head: list[tuple[int, str]] = []
@@ -288,6 +291,18 @@ def _filled(cell: object) -> bool:
     return cell is not None and str(cell).strip() != ""
 
 
+def table_of(
+    file: str, names: Sequence[str], rows: Sequence[_Cells], lines: Sequence[int], comma: bool, notes: Sequence[str]
+) -> Table:
+    """A table of cells whose headers are ``name[unit]``; comma: whether it is the decimal separator.
+
+    Raises as `read_table`.
+    """
+    header, numbers = read_header(names, file), np.array(lines, dtype=np.int64)
+    values, bad = _read_cells(rows, header, file, numbers, decimal_comma=comma)
+    return _kept(file, header, values, numbers, bad, notes)
+
+
 def mapped(table: Table, columns: Mapping[str, str]) -> Table:
     """A table that was read without a map of columns, with its names and units as the map has them.
 
@@ -315,7 +330,7 @@ def _kept(
     return Table(file, header.units, values[:, header.kept], lines, cells, notes=tuple(notes), start=start)
 
 
-class _Text:
+class TextFile:
     """The lines of a file, of which only the bytes are held; `notes` says where its code page had to be guessed."""
 
     def __init__(self, file: str) -> None:
@@ -342,7 +357,7 @@ class _Text:
                 yield number, line.removesuffix("\n")
 
 
-def _has_decimal_commas(text: _Text, header: int, separator: str) -> bool:
+def _has_decimal_commas(text: TextFile, header: int, separator: str) -> bool:
     """Whether commas are decimal separators below a header: there are some, and no cell is a number with a point."""
     if not any("," in row for number, row in text.filled() if number > header):
         return False

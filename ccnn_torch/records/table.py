@@ -35,6 +35,8 @@ class Table:
         parts: where rows are from, in order: file and number of its rows; empty for a single file.
         notes: remarks on how the file was read, one sentence each.
         start: how many rows of the file stand before these, where this is a part of it.
+        words: what the file calls columns that were given names of ours.
+        declared: `m` or `rad` -> unit that the file says lengths or angles are in where their headers have none.
     """
 
     path: str
@@ -45,6 +47,8 @@ class Table:
     parts: tuple[tuple[str, int], ...] = ()
     notes: tuple[str, ...] = ()
     start: int = 0
+    declared: Mapping[str, str] = field(default_factory=dict)
+    words: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -313,6 +313,7 @@ def joints_table(results: Block) -> Table | None:
         what = ", ".join(words_of(effect).short for effect in own["effects"]) or "–"
         removed = " → ".join(size_text(own[key], results["gap"]) for key in ("gap_before", "gap_after"))
         sure = probability_words(own["probability"])
+        name = f"{name} {own.get('word', '')}".strip()
         rows.append((name, what, ", ".join(said) or "–", sure, removed, "; ".join(rest) or "–"))
     columns = ("joint", "what is wrong", "number", "how sure", "gap", "or, and what is left")
     note = "Probability of each joint's names, those that cannot be told apart taken as one; gaps are of runs held out."

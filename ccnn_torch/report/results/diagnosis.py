@@ -159,6 +159,8 @@ class Verdict(Result):
 
 class JointVerdict(Result):
     joint: str
+    word: str = ""
+    """what the source of the logs calls the joint"""
     effects: list[str]
     classes: dict[str, list[str]]
     """of each effect what can stand in its place at this joint"""
