@@ -145,24 +145,45 @@ def export(
     model: Annotated[
         Path, typer.Argument(help="A .safetensors file with its card, an identified.yaml or diagnosis.json.")
     ],
-    to: Annotated[str, typer.Option(help="c99, st (IEC 61131-3 Structured Text), linuxcnc, onnx, urdf or table.")],
+    to: Annotated[str, typer.Option(help="The target, one of the list.")],
     out: OutFolder,
     dtype: Annotated[str, typer.Option(help="float64 or float32, in which the controller computes.")] = "float64",
     sd: Annotated[bool, typer.Option("--sd", help="Add a function for the deviation's standard deviation.")] = False,
+    current: Annotated[
+        Path | None,
+        typer.Option(help="Your file of the stack, which is read: printer.cfg, calibration.json, a PAL robot's URDF."),
+    ] = None,
     public_key: PublicKey = None,
     allow_code: AllowCode = False,
     quiet: Quiet = False,
 ) -> None:
     """Write a model for a controller: both directions, with domain, limit and fallback inside; or for a simulator.
 
-    c99 writes compensator.h, compensator.c, selftest.c and a Makefile: make test builds them without warnings and
-    compares more than a thousand golden vectors. The code has no heap, no recursion and no global state, and does
-    the same operations in each call. st writes compensator.st, selftest.st and a README.md for TwinCAT and CODESYS.
-    linuxcnc writes ccnnkins.comp, the machine's kinematics with the compensation around them, for halcompile; of an
-    identified.yaml the kinematics with the identified parameters. onnx writes model.onnx with master and card, and
-    controller.onnx with the command alone. urdf writes an arm with its identified links as URDF, MuJoCo model and DH
-    table. table writes the deviation over a grid, tables of single axes and a mesh where they suffice, and how far off
-    each of them is.
+    c99: compensator.h, compensator.c, selftest.c and a Makefile. make test builds them without warnings and compares
+    more than a thousand golden vectors. No heap, no recursion, no global state; the same operations in each call.
+
+    st: compensator.st, selftest.st and a README.md for TwinCAT and CODESYS (IEC 61131-3 Structured Text).
+
+    linuxcnc: ccnnkins.comp, the machine's kinematics with the compensation around them, for halcompile; of an
+    identified.yaml the kinematics with the identified parameters.
+
+    onnx: model.onnx with master and card, and controller.onnx with the command alone.
+
+    table: the deviation over a grid, tables of single axes and a mesh where they suffice, and how far off each is.
+
+    urdf, mjcf: an arm with its identified links as URDF, MuJoCo model and DH table.
+
+    ur: kinematics.yaml of a UR arm for ur_description and ur_robot_driver; --current keeps its hash.
+
+    pal: master_calibration.yaml of a PAL robot, whose URDF is --current.
+
+    lerobot: calibration.json with the joints' zeros; the one that is there is --current.
+
+    klipper: printer.cfg with radius, rods, angles and endstops of a delta printer; the one that is there is --current.
+
+    linuxcnc_hal: kinematics.hal, the numbers of genhexkins (hexapods) or genserkins (arms of six turning joints).
+
+    Files of numbers hold the geometry alone: the screen and their README.md say what they leave.
 
     Source code returns the same codes: 0 exact; 1 outside the domain, or where the model broke its limit; 2 where an
     input is not finite: then command = joints, with the middle of the domain for what is no number and its edge for
@@ -181,16 +202,25 @@ def export(
     ccnn export checkpoints/tripod/model.safetensors --to linuxcnc --out kins
 
     ccnn export runs/arm/identified.yaml --to urdf --out robot
+
+    ccnn export runs/ur10/diagnosis.json --to ur --out robot
+
+    ccnn export runs/printer/identified.yaml --to klipper --current printer.cfg --out firmware
     """
     with if_stopped(NOTHING_WRITTEN):
-        from ccnn_torch.compensation import export_model
+        from ccnn_torch.compensation.targets.export import export_told
 
-        files = export_model(model, to, out, dtype, sd, public_key, allow_code)
+        files, left = export_told(model, to, out, dtype, sd, public_key, allow_code, current)
     if not quiet:
         proven = "; their operations give the model's numbers" if to in ("c99", "st", "linuxcnc", "onnx") else ""
         typer.echo(f"{out}: {', '.join(files)} written{proven}.")
         if to == "c99":
             typer.echo(f"Compile them and compare golden vectors: make -C {out} test")
+        if left:
+            from ccnn_torch.report.screen import say
+
+            say(left)
+            typer.echo(f"How to load them: {out / 'README.md'}")
 
 
 def verify(

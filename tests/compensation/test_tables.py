@@ -171,7 +171,7 @@ def test_identified_links_go_back_into_a_simulator(tmp_path: Path, cli: Cli) -> 
     about = fields() | {"mechanism": arm.describe()}
     path = save_model(tmp_path, made, about, forms=("safetensors",))["safetensors"]
     assert cli("export", path, "--to", "urdf", "--out", tmp_path / "robot")[0] == 0
-    assert {p.name for p in (tmp_path / "robot").iterdir()} == {"robot.urdf", "robot.xml", "robot.yaml"}
+    assert {p.name for p in (tmp_path / "robot").iterdir()} == {"robot.urdf", "robot.xml", "robot.yaml", "README.md"}
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot" / "robot.xml"))
     data, site = mujoco.MjData(model), 0
     # The tool's rotation is not determined by positions: that of the model counts.
@@ -216,7 +216,7 @@ def test_what_cannot_be_exported_says_so(tmp_path: Path, cli: Cli) -> None:
     path = save_model(tmp_path, tripod_compensator(), fields(), forms=("safetensors",))["safetensors"]
     for to, sentence in (
         ("urdf", "no identified links of an arm"),
-        ("matlab", "there is no target 'matlab'; there are c99, st, linuxcnc, onnx, urdf, table"),
+        ("matlab", "there is no target 'matlab'; there are c99, st, linuxcnc, onnx, table, urdf, mjcf,"),
     ):
         code, _, err = cli("export", path, "--to", to, "--out", tmp_path / "out")
         assert code == 2 and sentence in err and "Traceback" not in err
