@@ -30,8 +30,13 @@ def compensate(
     model: Annotated[
         Path, typer.Argument(help=".safetensors, .onnx, identified.yaml, diagnosis.json or identified_motion.json.")
     ],
-    input: Annotated[Path, typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit].")],
-    output: Annotated[Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands.")],
+    input: Annotated[
+        Path,
+        typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit]. Or a robot's or CNC program."),
+    ],
+    output: Annotated[
+        Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands; or the program, corrected.")
+    ],
     pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
     back: Annotated[bool, typer.Option("--back", help="IN has commands; OUT gets the ideal joints.")] = False,
     sd: Annotated[bool, typer.Option("--sd", help="OUT gets the deviations' standard deviations, too.")] = False,
@@ -39,13 +44,15 @@ def compensate(
         str | None,
         typer.Option(
             metavar=_FRAME,
-            help="With --pose, of an arm: another tool than the measured one, from the end of the last link.",
+            help="With --pose or a program, of an arm: another tool than the measured one, from the last link's end.",
         ),
     ] = None,
     base: Annotated[
         str | None,
         typer.Option(
-            metavar=_FRAME, help="With --pose, of an arm: the frame that poses are given in, in the measured one."
+            metavar=_FRAME,
+            help="With --pose, of an arm: the frame that poses are given in, in the measured one. With a program: "
+            "the frame of its positions, in the machine's own base.",
         ),
     ] = None,
     public_key: PublicKey = None,
@@ -71,6 +78,11 @@ def compensate(
     motion that is wanted, and OUT.csv gets corrected1[unit]…, the commands at which the machine follows it, and
     predicted1[unit]…, where it then goes.
 
+    IN may be a program: G-code (.nc, .ngc, .gcode, .tap, .cnc), KRL (.src, .dat) or RAPID (.mod, .prg). OUT is the same
+    program with other numbers in its positions, and nothing else: straight moves G0 and G1, frames {X …} and axes
+    {A1 …}, robtarget and jointtarget. Positions that are out of reach or of the measured domain, or whose correction
+    exceeds the model's limit, are left and listed, and the exit code is 2.
+
     Every row is checked against the model's card. Where the model violates it (a number that is not finite, a
     deviation above most_deviation), the row has command = joints and inside_domain = 0, and the exit code is 2.
 
@@ -90,16 +102,23 @@ def compensate(
 
     ccnn compensate runs/axis/identified_motion.json motion.csv commands.csv
 
+    ccnn compensate runs/kr10/diagnosis.json weld.src weld_corrected.src --tool "0,0,120mm,0,90deg,0"
+
     ccnn compensate from_a_stranger/model.onnx joints.csv commands.csv --public-key theirs.public.pem
     """
     if pose and back:
         raise InputError("--pose and --back exclude each other: --pose takes wanted poses, --back takes commands")
+    from ccnn_torch.compensation.programs import PROGRAMS
+
+    program = input.suffix.lower() in PROGRAMS
+    if program and (pose or back or sd):
+        raise InputError(f"{input}: a program takes none of --pose, --back and --sd; give a table for these")
     if sd and back:
         raise InputError(
             "--sd and --back exclude each other: --sd gives the standard deviation of a command, --back takes commands"
         )
     for option, frame in (("--tool", tool), ("--base", base)):
-        if frame is not None and not pose:
+        if frame is not None and not pose and not program:
             raise InputError(f"{option}: needs --pose; joints are the same with every tool and in every frame")
     for file, what in ((input, "IN.csv"), (model, "the model")):
         if os.path.realpath(output) == os.path.realpath(file):
@@ -111,14 +130,21 @@ def compensate(
         if is_of_motion(model):
             from ccnn_torch.motion.compensate import compensate_motion
 
-            if pose or back or sd or public_key:
-                raise InputError(f"{model}: a model of a motion takes none of --pose, --back, --sd and --public-key")
+            if pose or back or sd or public_key or program:
+                raise InputError(
+                    f"{model}: a model of a motion takes a table, and none of --pose, --back, --sd and --public-key"
+                )
             said = [f"{sentence}." for sentence in compensate_motion(model, input, output, allow_code)]
         else:
             frames = [
                 None if text is None else _numbers(text, f"--{o}") for o, text in (("tool", tool), ("base", base))
             ]
-            said, refused = compensate_table(model, input, output, pose, back, sd, public_key, allow_code, *frames)
+            if program:
+                from ccnn_torch.compensation.programs.job import compensate_program
+
+                said, refused = compensate_program(model, input, output, public_key, allow_code, *frames)
+            else:
+                said, refused = compensate_table(model, input, output, pose, back, sd, public_key, allow_code, *frames)
     if not quiet:
         from ccnn_torch.report.screen import say
 

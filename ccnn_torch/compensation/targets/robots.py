@@ -33,6 +33,7 @@ from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.dh_file import URDF_LIMIT, axis_of, link_of, triple
 from ccnn_torch.mechanisms.mechanism_file import chain_of, dh_text, mjcf_text, urdf_text
+from ccnn_torch.numerics.rotations import nearest_euler
 
 _HALF = math.pi / 2
 
@@ -190,7 +191,7 @@ def print_pal(found: Found) -> Stack:
     for joint, before, after in zip(joints, _plain(nominal), _plain(identified), strict=True):
         xyz, angles = _origin(path, joint)
         moved = of_rpy(xyz, angles) @ np.linalg.inv(before) @ after
-        turned = _nearest_rpy(rpy(moved), angles)
+        turned = nearest_euler(rpy(moved), angles)
         deltas = [a - b for a, b in zip([*place_of(moved), *turned], [*xyz, *angles], strict=True)]
         name = str(joint.get("name")).removesuffix("_joint")
         if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
@@ -213,14 +214,6 @@ def print_pal(found: Found) -> Stack:
 def _plain(arm: SerialArm) -> list[Array]:
     """Transforms before each joint's motion, in the arm's own frames."""
     return [matrix(*(part.numpy() for part in origin)) for origin in chain_of(arm)[1]]
-
-
-def _nearest_rpy(angles: Sequence[float], wanted: Sequence[float]) -> list[float]:
-    """Of the two ways to write a rotation and their full turns the one nearest to another."""
-    roll, pitch, yaw = angles
-    ways = ((roll, pitch, yaw), (roll + math.pi, math.pi - pitch, yaw + math.pi))
-    near = [[w + math.remainder(a - w, 2 * math.pi) for a, w in zip(way, wanted, strict=True)] for way in ways]
-    return min(near, key=lambda way: math.dist(way, wanted))
 
 
 def print_lerobot(found: Found) -> Stack:
