@@ -29,6 +29,8 @@ from ccnn_torch.plugins import code_refused
 from ccnn_torch.records.joint_map import read_joint_map
 
 _LARGEST = 100_000_000
+# By what share of their travel joints may be beyond random ones in it.
+_EDGE = 0.005
 # Lines that a sentence names at most.
 _NAMED = 10
 
@@ -76,6 +78,11 @@ class Corrections:
         self._loaded, self._machine = loaded, machine
         self._base = np.eye(4) if base is None else _matrix(torch.tensor(list(base), dtype=torch.float64))
         self._counted = read_joint_map(loaded.joint_map, loaded.joints, loaded.columns)
+        # The file of geometry alone does not say where it was measured: its geometry holds as far as the joints go.
+        self._region = None
+        if loaded.machine is not None and not len(loaded.machine.joints):
+            low, high = loaded.region.T
+            self._region = (low + high) / 2, (0.5 + _EDGE) * (high - low)
         self.turns = len(machine.joints) > 3 and machine.frame(machine.home_pose)[1] is not None
 
     def require(self, path: Path) -> None:
@@ -102,6 +109,9 @@ class Corrections:
                 given = np.broadcast_to(centre, (len(rows), len(centre))) if len(centre) else None
                 parts.append(self._loaded(rows, given))
         found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        inside = found["inside_domain"]
+        if self._region is not None:
+            inside = (np.abs(ideal - self._region[0]) <= self._region[1]).all(-1)
         frames = self._frames(found["command"])
         if not self.turns:
             # What a machine does not turn stays as it is written.
@@ -112,7 +122,7 @@ class Corrections:
             if not reasons[k]:
                 if found["fallback"][k]:
                     reasons[k] = "the correction is above the limit of the model"
-                elif not found["inside_domain"][k]:
+                elif not inside[k]:
                     reasons[k] = "outside what was measured"
                 elif point.frame is not None and not np.isfinite(frames[k]).all():
                     reasons[k] = "the corrected pose is none of the machine"
@@ -122,15 +132,19 @@ class Corrections:
         damped = sum(not reason and status == DAMPED for reason, status in zip(reasons, found["status"], strict=True))
         return changed, reasons, damped
 
-    def apart(self, point: Point, other: Array) -> tuple[float, float]:
-        """Distance [m] and angle [rad] between a position and what stands in its place."""
-        if point.frame is not None:
-            pair = np.stack([point.frame, other])
-        else:
-            assert point.joints is not None
-            pair = self._frames(np.stack([self._own(point.joints), self._own(other)]))
-        turn = matrix_to_rotation_vector(torch.from_numpy(pair[1][:3, :3] @ pair[0][:3, :3].T))
-        return float(np.linalg.norm(pair[1][:3, 3] - pair[0][:3, 3])), float(turn.norm())
+    def apart(self, points: Sequence[Point], stands: Sequence[Array | None]) -> Array:
+        """Distance [m] and angle [rad] between positions and what stands in their place, where that is another."""
+        pairs = [(p, there) for p, there in zip(points, stands, strict=True) if there is not None]
+        frames = np.zeros((len(pairs), 2, 4, 4))
+        turned = [k for k, (point, _) in enumerate(pairs) if point.frame is None]
+        for k, (point, there) in enumerate(pairs):
+            frames[k] = 0 if point.frame is None else np.stack([point.frame, there])
+        if turned:
+            joints = np.stack([[self._own(pairs[k][0].joints), self._own(pairs[k][1])] for k in turned])  # type: ignore[arg-type]
+            frames[turned] = self._frames(joints.reshape(-1, joints.shape[-1])).reshape(-1, 2, 4, 4)
+        was, now = torch.from_numpy(frames).unbind(1)
+        turn = matrix_to_rotation_vector(now[:, :3, :3] @ was[:, :3, :3].mT).norm(dim=-1)
+        return torch.stack([(now - was)[:, :3, 3].norm(dim=-1), turn], -1).numpy()
 
     def _ideal(self, points: Sequence[Point]) -> tuple[Array, list[str]]:
         """Joints of all positions, `s x n` [SI], and why there are none."""
@@ -146,6 +160,7 @@ class Corrections:
         # One branch alone, of any number of positions at once.
         one = not machine.orientations or (isinstance(machine, SerialArm) and not bool(machine.revolute.any()))
         solved = machine.solve_inverse(poses) if one and frames else None
+        there = None if solved is None else arrives(machine, solved, poses, ROUNDED)
         at = {k: i for i, k in enumerate(frames)}
         for k, point in enumerate(points):
             if point.joints is not None:
@@ -156,15 +171,16 @@ class Corrections:
                 guess = torch.from_numpy(joints[k])
             elif point.frame is not None:
                 pose = poses[at[k]]
-                if solved is None:
+                if solved is None or there is None:
                     if guess is None:
                         guess = nearest_measured(machine, torch.from_numpy(self._loaded.region), pose)
                     row = follow(machine, pose[None], guess, ROUNDED)[0]
                     turning = torch.tensor([c.unit == "rad" for c in machine.joints])
                     row = row - torch.where(turning, 2 * torch.pi * torch.round((row - guess) / (2 * torch.pi)), 0.0)
+                    reached = bool(arrives(machine, row, pose, ROUNDED))
                 else:
-                    row = solved[at[k]]
-                if bool(arrives(machine, row, pose, ROUNDED)):
+                    row, reached = solved[at[k]], bool(there[at[k]])
+                if reached:
                     joints[k], guess = row.numpy(), row
                 else:
                     reasons[k] = "out of reach"
@@ -226,9 +242,7 @@ def compensate_program(
     changed, reasons, damped = corrections.of(program.points)
     found, stands = program.written(changed)
     write_whole(output, found.encode("latin-1"))
-    moved = np.array(
-        [corrections.apart(p, there) for p, there in zip(program.points, stands, strict=True) if there is not None]
-    ).reshape(-1, 2)
+    moved = corrections.apart(program.points, stands)
     said = [f"{output}: {len(moved)} of {len(program.points)} positions corrected{_by(moved)}."]
     if damped:
         said.append(f"{damped} of them near a singular pose or at a limit, with the nearest safe command.")
