@@ -195,7 +195,8 @@ def export(
 
     onnx: model.onnx with master and card, and controller.onnx with the command alone.
 
-    table: the deviation over a grid, tables of single axes and a mesh where they suffice, and how far off each is.
+    table, beckhoff: the deviation over a grid, tables of single axes (LinuxCNC, Heidenhain, Beckhoff), the grid of
+    TF5280 and a mesh where they suffice, and how far off each is.
 
     urdf, mjcf: an arm with its identified links as URDF, MuJoCo model and DH table.
 

@@ -112,6 +112,7 @@ TARGETS: dict[str, Callable[[_Order], Mapping[str, str | bytes]]] = {
     "linuxcnc": _linuxcnc,
     "onnx": _onnx,
     "table": _table,
+    "beckhoff": _table,
     "urdf": lambda order: order.written(print_robot, "Links"),
     "mjcf": lambda order: order.written(print_robot, "Links"),
     "ur": lambda order: order.written(print_ur, "Kinematics"),
