@@ -119,8 +119,8 @@ _FORMS = {
     "`file[0] ...\\beckhoff_grid.csv`, `file_format[0] ISG_CSV` in its list, and `vol_comp[0].max_records 2000` in "
     "hochlauf.lis. It has the errors of the place over X, Y and Z as EXX, EYX, EZX [mm], what the machine is beyond "
     "the command; angles are not in it. Check the sign with one point: `negate` turns it.",
-    "beckhoff_axis": "`beckhoff_axis_JOINT.lis`: an axis compensation list (`kw.ssfk`, 0.1 um or 0.0001 deg, actual less "
-    "commanded, in both directions) of TwinCAT CNC and ISG kernels; write the number of your axis into "
+    "beckhoff_axis": "`beckhoff_axis_JOINT.lis`: an axis compensation list (`kw.ssfk`, 0.1 um or 0.0001 deg, actual "
+    "less commanded, in both directions) of TwinCAT CNC and ISG kernels; write the number of your axis into "
     "`kopf.log_achs_nr`, and activate it by `lr_param.ssfk 1`.",
     "klipper": "`klipper_mesh.cfg` is a saved profile of `[bed_mesh]` for the section SAVE_CONFIG of printer.cfg.",
 }
