@@ -195,6 +195,9 @@ def export(
 
     onnx: model.onnx with master and card, and controller.onnx with the command alone.
 
+    ros2_control: a chainable controller in C++ around the code of c99, as a package; or, where offsets of the joints
+    suffice, these for the transmissions in the URDF.
+
     table, beckhoff: the deviation over a grid, tables of single axes (LinuxCNC, Heidenhain, Beckhoff), the grid of
     TF5280 and a mesh where they suffice, and how far off each is.
 
@@ -239,7 +242,11 @@ def export(
 
         files, left = export_told(model, to, out, dtype, sd, public_key, allow_code, current)
     if not quiet:
-        proven = "; their operations give the model's numbers" if to in ("c99", "st", "linuxcnc", "onnx") else ""
+        proven = (
+            "; their operations give the model's numbers"
+            if to in ("c99", "st", "linuxcnc", "onnx") or "compensator.c" in files
+            else ""
+        )
         typer.echo(f"{out}: {', '.join(files)} written{proven}.")
         if to == "c99":
             typer.echo(f"Compile them and compare golden vectors: make -C {out} test")

@@ -77,7 +77,7 @@ def exported(folder: Path, machine: str, joints: list[str], more: list[str], uni
     numbers.write_text(mechanism_text(turning, before), encoding="utf-8")
     motor = {"id": 1, "drive_mode": 0, "homing_offset": 1, "range_min": 0, "range_max": 4095}
     current.write_text(json.dumps({name: motor for name in (*joints, *more, machine, *"abcdef")}), encoding="utf-8")
-    orders = {"c99": model, "st": model, "linuxcnc": model, "table": model, "urdf": links}
+    orders = {"c99": model, "st": model, "linuxcnc": model, "table": model, "urdf": links, "ros2_control": model}
     for to, path in (orders | dict.fromkeys(("ur", "linuxcnc_hal", "lerobot"), numbers)).items():
         for name, file in export_model(path, to, folder / to, current=current if to == "lerobot" else None).items():
             assert file.parent == folder / to and re.fullmatch(r"\w+\.\w+|Makefile", file.name, re.ASCII)
@@ -115,8 +115,12 @@ def test_names_are_never_code(fresh: Any, machine: str, joints: list[str], more:
             # Two inputs of one name.
             assert {*joints} & {*more}
             return
-        for name in ("selftest.c", "Makefile", "compensator.c"):
-            assert found[f"c99/{name}"] == wanted[f"c99/{name}"]
+        for name in ("c99/selftest.c", "c99/Makefile", "c99/compensator.c", "ros2_control/compensator.c"):
+            assert found[name] == wanted[name]
+        for name in ("package.xml", "plugin.xml", "controllers.yaml", "CMakeLists.txt"):
+            assert found[f"ros2_control/{name}"] == wanted[f"ros2_control/{name}"]
+        controller, plain = (text["ros2_control/compensation.cpp"].partition("*/") for text in (found, wanted))
+        assert controller[2] == plain[2] and controller[0].count("/*") == 1
         for compiler in COMPILERS:
             sources = [str(folder / "c99" / name) for name in ("selftest.c", "compensator.c")]
             subprocess.run([compiler, *STRICT, "-fsyntax-only", *sources], check=True)

@@ -19,6 +19,7 @@ from ccnn_torch.compensation.targets.lowered import Found, Stack, with_readme
 from ccnn_torch.compensation.targets.machines import print_hal, print_klipper
 from ccnn_torch.compensation.targets.onnx_export import export_onnx
 from ccnn_torch.compensation.targets.robots import print_lerobot, print_pal, print_robot, print_ur
+from ccnn_torch.compensation.targets.ros2_control import middle_of, offsets_alone, print_ros2_control
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.display import plain
@@ -47,9 +48,13 @@ class _Order:
 
     def written(self, make: Callable[[Found], Stack], title: str) -> dict[str, str]:
         """Numbers of a stack with their README.md."""
-        found = Found(self.model, self.current, self.allow_code)
+        found = self.found
         files, self.said = with_readme(make(found), found, f"{title} of {plain(found.nominal.name)}")
         return files
+
+    @property
+    def found(self) -> Found:
+        return Found(self.model, self.current, self.allow_code)
 
     def compensator(self) -> Compensator:
         if self.model.compensator is None:
@@ -106,11 +111,22 @@ def _table(order: _Order) -> dict[str, str]:
     return print_tables(order.compensator(), order.mechanism() if known else None)
 
 
+def _ros2_control(order: _Order) -> Mapping[str, str]:
+    if order.dtype != "float64":
+        raise InputError("ros2_control computes in double; leave out --dtype float32")
+    found = order.found
+    offsets, said = offsets_alone(found)
+    if offsets is not None:
+        return order.written(lambda _: offsets, "Zeros of the joints")
+    return print_ros2_control(*order.proven(), middle_of(found), said)
+
+
 TARGETS: dict[str, Callable[[_Order], Mapping[str, str | bytes]]] = {
     "c99": lambda order: print_c99(*order.proven()),
     "st": lambda order: print_structured_text(*order.proven()),
     "linuxcnc": _linuxcnc,
     "onnx": _onnx,
+    "ros2_control": _ros2_control,
     "table": _table,
     "beckhoff": _table,
     "urdf": lambda order: order.written(print_robot, "Links"),

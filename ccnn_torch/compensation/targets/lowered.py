@@ -132,27 +132,31 @@ def with_readme(stack: Stack, found: Found, title: str) -> tuple[dict[str, str],
 
 def left_over(held: Mechanism, found: Found) -> str:
     """How far the machine of a stack is from the real one over the domain, as a sentence."""
-    joints, truth = found.rows.joints, found.truth
 
-    def far(machine: Mechanism, largest: bool = False) -> str:
-        error = machine.pose_error(machine.forward_kinematics(joints, guess=truth), truth)
-        told = []
-        for values, unit in ((error.position, "um"), (error.rotation, "urad")):
-            if values is not None:
-                fine = 1e6 * values[torch.isfinite(values)]
-                told.append(f"{_short(float(fine.max() if largest else fine.square().mean().sqrt()))} {unit}")
-        return " and ".join(told)
+    def told(values: Sequence[float]) -> str:
+        return " and ".join(f"{_short(1e6 * v)} {unit}" for v, unit in zip(values, ("um", "urad"), strict=False))
 
+    most = [float(error.max()) for error in _errors(held, found)]
     said = (
-        f"Over {len(joints)} random joints of the domain of the model this leaves {far(held)} (RMS), {far(held, True)} "
-        f"at most, of {far(found.nominal)} of the nominal machine."
+        f"Over {len(found.rows.joints)} random joints of the domain of the model this leaves {told(rms(held, found))} "
+        f"(RMS), {told(most)} at most, of {told(rms(found.nominal, found))} of the nominal machine."
     )
     if found.beside:
         said += (
             f" Numbers of a geometry hold nothing of {plain(found.beside)}: the whole identified geometry leaves "
-            f"{far(found.identified)}."
+            f"{told(rms(found.identified, found))}."
         )
     return said
+
+
+def rms(machine: Mechanism, found: Found) -> list[float]:
+    """How far a machine is from the real one: position [m] and, where there is an orientation, rotation [rad]."""
+    return [float(error.square().mean().sqrt()) for error in _errors(machine, found)]
+
+
+def _errors(machine: Mechanism, found: Found) -> list[Tensor]:
+    pose = machine.forward_kinematics(found.rows.joints, guess=found.truth)
+    return [e[torch.isfinite(e)] for e in machine.pose_error(pose, found.truth) if e is not None]
 
 
 def _short(value: float) -> str:
