@@ -130,10 +130,10 @@ def compensate(
         if is_of_motion(model):
             from ccnn_torch.motion.compensate import compensate_motion
 
-            if pose or back or sd or public_key or program:
-                raise InputError(
-                    f"{model}: a model of a motion takes a table, and none of --pose, --back, --sd and --public-key"
-                )
+            if pose or back or sd or public_key:
+                raise InputError(f"{model}: a model of a motion takes none of --pose, --back, --sd and --public-key")
+            if program:
+                raise InputError(f"{model}: a model of a motion corrects a table of times, not a program")
             said = [f"{sentence}." for sentence in compensate_motion(model, input, output, allow_code)]
         else:
             frames = [

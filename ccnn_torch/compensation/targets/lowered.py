@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.parts import ROWS, all_over
-from ccnn_torch.display import plain
+from ccnn_torch.display import number_text, plain
 from ccnn_torch.effects import Situation, measured_pose, reached
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
@@ -160,7 +160,7 @@ def _errors(machine: Mechanism, found: Found) -> list[Tensor]:
 
 
 def _short(value: float) -> str:
-    return f"{value:.3g}" if value >= 1e-3 else "less than 0.001"
+    return number_text(value, 3) if value >= 1e-3 else "less than 0.001"
 
 
 class Chain(NamedTuple):
