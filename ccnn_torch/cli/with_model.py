@@ -30,8 +30,13 @@ def compensate(
     model: Annotated[
         Path, typer.Argument(help=".safetensors, .onnx, identified.yaml, diagnosis.json or identified_motion.json.")
     ],
-    input: Annotated[Path, typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit].")],
-    output: Annotated[Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands.")],
+    input: Annotated[
+        Path,
+        typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit]. Or a robot's or CNC program."),
+    ],
+    output: Annotated[
+        Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands; or the program, corrected.")
+    ],
     pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
     back: Annotated[bool, typer.Option("--back", help="IN has commands; OUT gets the ideal joints.")] = False,
     sd: Annotated[bool, typer.Option("--sd", help="OUT gets the deviations' standard deviations, too.")] = False,
@@ -39,13 +44,15 @@ def compensate(
         str | None,
         typer.Option(
             metavar=_FRAME,
-            help="With --pose, of an arm: another tool than the measured one, from the end of the last link.",
+            help="With --pose or a program, of an arm: another tool than the measured one, from the last link's end.",
         ),
     ] = None,
     base: Annotated[
         str | None,
         typer.Option(
-            metavar=_FRAME, help="With --pose, of an arm: the frame that poses are given in, in the measured one."
+            metavar=_FRAME,
+            help="With --pose, of an arm: the frame that poses are given in, in the measured one. With a program: "
+            "the frame of its positions, in the machine's own base.",
         ),
     ] = None,
     public_key: PublicKey = None,
@@ -71,6 +78,11 @@ def compensate(
     motion that is wanted, and OUT.csv gets corrected1[unit]…, the commands at which the machine follows it, and
     predicted1[unit]…, where it then goes.
 
+    IN may be a program: G-code (.nc, .ngc, .gcode, .tap, .cnc), KRL (.src, .dat) or RAPID (.mod, .prg). OUT is the same
+    program with other numbers in its positions, and nothing else: straight moves G0 and G1, frames {X …} and axes
+    {A1 …}, robtarget and jointtarget. Positions that are out of reach or of the measured domain, or whose correction
+    exceeds the model's limit, are left and listed, and the exit code is 2.
+
     Every row is checked against the model's card. Where the model violates it (a number that is not finite, a
     deviation above most_deviation), the row has command = joints and inside_domain = 0, and the exit code is 2.
 
@@ -90,16 +102,23 @@ def compensate(
 
     ccnn compensate runs/axis/identified_motion.json motion.csv commands.csv
 
+    ccnn compensate runs/kr10/diagnosis.json weld.src weld_corrected.src --tool "0,0,120mm,0,90deg,0"
+
     ccnn compensate from_a_stranger/model.onnx joints.csv commands.csv --public-key theirs.public.pem
     """
     if pose and back:
         raise InputError("--pose and --back exclude each other: --pose takes wanted poses, --back takes commands")
+    from ccnn_torch.compensation.programs import PROGRAMS
+
+    program = input.suffix.lower() in PROGRAMS
+    if program and (pose or back or sd):
+        raise InputError(f"{input}: a program takes none of --pose, --back and --sd; give a table for these")
     if sd and back:
         raise InputError(
             "--sd and --back exclude each other: --sd gives the standard deviation of a command, --back takes commands"
         )
     for option, frame in (("--tool", tool), ("--base", base)):
-        if frame is not None and not pose:
+        if frame is not None and not pose and not program:
             raise InputError(f"{option}: needs --pose; joints are the same with every tool and in every frame")
     for file, what in ((input, "IN.csv"), (model, "the model")):
         if os.path.realpath(output) == os.path.realpath(file):
@@ -113,12 +132,19 @@ def compensate(
 
             if pose or back or sd or public_key:
                 raise InputError(f"{model}: a model of a motion takes none of --pose, --back, --sd and --public-key")
+            if program:
+                raise InputError(f"{model}: a model of a motion corrects a table of times, not a program")
             said = [f"{sentence}." for sentence in compensate_motion(model, input, output, allow_code)]
         else:
             frames = [
                 None if text is None else _numbers(text, f"--{o}") for o, text in (("tool", tool), ("base", base))
             ]
-            said, refused = compensate_table(model, input, output, pose, back, sd, public_key, allow_code, *frames)
+            if program:
+                from ccnn_torch.compensation.programs.job import compensate_program
+
+                said, refused = compensate_program(model, input, output, public_key, allow_code, *frames)
+            else:
+                said, refused = compensate_table(model, input, output, pose, back, sd, public_key, allow_code, *frames)
     if not quiet:
         from ccnn_torch.report.screen import say
 
@@ -145,24 +171,49 @@ def export(
     model: Annotated[
         Path, typer.Argument(help="A .safetensors file with its card, an identified.yaml or diagnosis.json.")
     ],
-    to: Annotated[str, typer.Option(help="c99, st (IEC 61131-3 Structured Text), linuxcnc, onnx, urdf or table.")],
+    to: Annotated[str, typer.Option(help="The target, one of the list.")],
     out: OutFolder,
     dtype: Annotated[str, typer.Option(help="float64 or float32, in which the controller computes.")] = "float64",
     sd: Annotated[bool, typer.Option("--sd", help="Add a function for the deviation's standard deviation.")] = False,
+    current: Annotated[
+        Path | None,
+        typer.Option(help="Your file of the stack, which is read: printer.cfg, calibration.json, a PAL robot's URDF."),
+    ] = None,
     public_key: PublicKey = None,
     allow_code: AllowCode = False,
     quiet: Quiet = False,
 ) -> None:
     """Write a model for a controller: both directions, with domain, limit and fallback inside; or for a simulator.
 
-    c99 writes compensator.h, compensator.c, selftest.c and a Makefile: make test builds them without warnings and
-    compares more than a thousand golden vectors. The code has no heap, no recursion and no global state, and does
-    the same operations in each call. st writes compensator.st, selftest.st and a README.md for TwinCAT and CODESYS.
-    linuxcnc writes ccnnkins.comp, the machine's kinematics with the compensation around them, for halcompile; of an
-    identified.yaml the kinematics with the identified parameters. onnx writes model.onnx with master and card, and
-    controller.onnx with the command alone. urdf writes an arm with its identified links as URDF, MuJoCo model and DH
-    table. table writes the deviation over a grid, tables of single axes and a mesh where they suffice, and how far off
-    each of them is.
+    c99: compensator.h, compensator.c, selftest.c and a Makefile. make test builds them without warnings and compares
+    more than a thousand golden vectors. No heap, no recursion, no global state; the same operations in each call.
+
+    st: compensator.st, selftest.st and a README.md for TwinCAT and CODESYS (IEC 61131-3 Structured Text).
+
+    linuxcnc: ccnnkins.comp, the machine's kinematics with the compensation around them, for halcompile; of an
+    identified.yaml the kinematics with the identified parameters.
+
+    onnx: model.onnx with master and card, and controller.onnx with the command alone.
+
+    ros2_control: a chainable controller in C++ around the code of c99, as a package; or, where offsets of the joints
+    suffice, these for the transmissions in the URDF.
+
+    table, beckhoff: the deviation over a grid, tables of single axes (LinuxCNC, Heidenhain, Beckhoff), the grid of
+    TF5280 and a mesh where they suffice, and how far off each is.
+
+    urdf, mjcf: an arm with its identified links as URDF, MuJoCo model and DH table.
+
+    ur: kinematics.yaml of a UR arm for ur_description and ur_robot_driver; --current keeps its hash.
+
+    pal: master_calibration.yaml of a PAL robot, whose URDF is --current.
+
+    lerobot: calibration.json with the joints' zeros; the one that is there is --current.
+
+    klipper: printer.cfg with radius, rods, angles and endstops of a delta printer; the one that is there is --current.
+
+    linuxcnc_hal: kinematics.hal, the numbers of genhexkins (hexapods) or genserkins (arms of six turning joints).
+
+    Files of numbers hold the geometry alone: the screen and their README.md say what they leave.
 
     Source code returns the same codes: 0 exact; 1 outside the domain, or where the model broke its limit; 2 where an
     input is not finite: then command = joints, with the middle of the domain for what is no number and its edge for
@@ -181,16 +232,29 @@ def export(
     ccnn export checkpoints/tripod/model.safetensors --to linuxcnc --out kins
 
     ccnn export runs/arm/identified.yaml --to urdf --out robot
+
+    ccnn export runs/ur10/diagnosis.json --to ur --out robot
+
+    ccnn export runs/printer/identified.yaml --to klipper --current printer.cfg --out firmware
     """
     with if_stopped(NOTHING_WRITTEN):
-        from ccnn_torch.compensation import export_model
+        from ccnn_torch.compensation.targets.export import export_told
 
-        files = export_model(model, to, out, dtype, sd, public_key, allow_code)
+        files, left = export_told(model, to, out, dtype, sd, public_key, allow_code, current)
     if not quiet:
-        proven = "; their operations give the model's numbers" if to in ("c99", "st", "linuxcnc", "onnx") else ""
+        proven = (
+            "; their operations give the model's numbers"
+            if to in ("c99", "st", "linuxcnc", "onnx") or "compensator.c" in files
+            else ""
+        )
         typer.echo(f"{out}: {', '.join(files)} written{proven}.")
         if to == "c99":
             typer.echo(f"Compile them and compare golden vectors: make -C {out} test")
+        if left:
+            from ccnn_torch.report.screen import say
+
+            say(left)
+            typer.echo(f"How to load them: {out / 'README.md'}")
 
 
 def verify(

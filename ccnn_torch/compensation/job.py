@@ -127,7 +127,7 @@ class WantedPoses:
             guess = torch.from_numpy(near if shown is None else shown.of_shown(near))
         self.chooses = bool(mechanism.orientations) and not guided
         if self.chooses:
-            before = _nearest(mechanism, self._region, poses[0]) if self._before is None else self._before
+            before = nearest_measured(mechanism, self._region, poses[0]) if self._before is None else self._before
             joints = follow(mechanism, poses, before, within)
             self._before = joints[-1]
         else:
@@ -203,7 +203,7 @@ def _units(table: Table, read: Sequence[str]) -> dict[str, str]:
     return {kind: units.pop() for kind, units in kinds.items() if len(units) == 1}
 
 
-def _nearest(mechanism: Mechanism, region: Tensor, pose: Tensor) -> Tensor:
+def nearest_measured(mechanism: Mechanism, region: Tensor, pose: Tensor) -> Tensor:
     """Joints in the region, lowest and highest `n x 2`, whose pose is among the nearest to one, `n` [SI]."""
     share = torch.rand(_LOOKED_AT, len(region), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     joints = region[:, 0] + (region[:, 1] - region[:, 0]) * share

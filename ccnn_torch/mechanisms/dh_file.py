@@ -161,7 +161,7 @@ def _number(value: Any, where: str) -> float:
 
 
 # Bytes; with inertias and meshes named, a robot has some 100 kB.
-_LARGEST = 20_000_000
+URDF_LIMIT = 20_000_000
 
 _MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
@@ -183,7 +183,7 @@ def read_urdf(
         InputError: one sentence that names the file and the joint or link: a branch without `tip`, an unknown link, a
             mimic, floating or planar joint in the chain, a number that is none.
     """
-    root = read_xml(path, _LARGEST, "give the path of a URDF")
+    root = read_xml(path, URDF_LIMIT, "give the path of a URDF")
     chain = _chain(path, root, base, tip)
     if len(chain) > 2 * MOST_JOINTS:
         raise InputError(f"{path}: the chain has {len(chain)} joints; up to {MOST_JOINTS} that move can be handled")
@@ -203,7 +203,7 @@ def read_urdf(
                 f"{path}: joint '{name}' {what}; a chain has revolute, continuous, prismatic and fixed ones"
             )
         links.append(_link_row(fixed))
-        axes.append(_axis(path, joint))
+        axes.append(axis_of(path, joint))
         types.append(_MOVING[kind])
         limits.append(_limit(path, joint, kind))
         fixed = _IDENTITY
@@ -229,11 +229,11 @@ _IDENTITY: _Transform = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype
 def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[Element]:
     """Joints from base to tip, found from the tip upwards."""
     joints = root.findall("joint")
-    parent_joint = {_link(path, j, "child"): j for j in joints}
+    parent_joint = {link_of(path, j, "child"): j for j in joints}
     if len(parent_joint) < len(joints):
-        twice = Counter(_link(path, j, "child") for j in joints).most_common(1)[0][0]
+        twice = Counter(link_of(path, j, "child") for j in joints).most_common(1)[0][0]
         raise InputError(f"{path}: link '{twice}' is the child of several joints; a chain has one")
-    parents = {_link(path, j, "parent") for j in joints}
+    parents = {link_of(path, j, "parent") for j in joints}
     known = [str(link.get("name")) for link in root.findall("link")]
     for link in (base, tip):
         if link is not None and link not in known:
@@ -251,7 +251,7 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
     link = tip
     while link != base and link in parent_joint and len(chain) <= len(joints):
         chain.append(parent_joint[link])
-        link = _link(path, parent_joint[link], "parent")
+        link = link_of(path, parent_joint[link], "parent")
     if len(chain) > len(joints):
         raise InputError(f"{path}: the joints above link '{tip}' form a loop; a chain begins at a link with no parent")
     if base is not None and link != base:
@@ -261,11 +261,11 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
 
 def _check_one_piece(path: str, known: list[str], joints: list[Element]) -> None:
     """Refuse links that hang in several trees with joints that move: the joint between them is missing."""
-    top = {_link(path, j, "child"): _link(path, j, "parent") for j in joints}
+    top = {link_of(path, j, "child"): link_of(path, j, "parent") for j in joints}
     # Each time twice as far up; one link at a time takes a minute for a hostile file.
     for _ in range(len(joints).bit_length()):
         top = {link: top.get(above, above) for link, above in top.items()}
-    roots = {top.get(link, link) for link in (_link(path, j, "parent") for j in joints if j.get("type") in _MOVING)}
+    roots = {top.get(link, link) for link in (link_of(path, j, "parent") for j in joints if j.get("type") in _MOVING)}
     pieces = [link for link in known if link in roots]
     if len(pieces) > 1:
         raise InputError(
@@ -274,7 +274,8 @@ def _check_one_piece(path: str, known: list[str], joints: list[Element]) -> None
         )
 
 
-def _link(path: str, joint: Element, role: str) -> str:
+def link_of(path: str, joint: Element, role: str) -> str:
+    """Name of the link that is `parent` or `child` of a joint of a URDF."""
     element = joint.find(role)
     name = None if element is None else element.get("link")
     if name is None:
@@ -282,7 +283,8 @@ def _link(path: str, joint: Element, role: str) -> str:
     return name
 
 
-def _triple(path: str, joint: Element, tag: str, attribute: str, default: str) -> Tensor:
+def triple(path: str, joint: Element, tag: str, attribute: str, default: str) -> Tensor:
+    """Three numbers of a joint of a URDF, as they are written."""
     element = joint.find(tag)
     text = default if element is None else element.get(attribute, default)
     try:
@@ -297,12 +299,13 @@ def _triple(path: str, joint: Element, tag: str, attribute: str, default: str) -
 
 
 def _origin(path: str, joint: Element) -> _Transform:
-    roll_pitch_yaw = _triple(path, joint, "origin", "rpy", "0 0 0")
-    return euler_zyx_to_matrix(roll_pitch_yaw.flip(-1)), _triple(path, joint, "origin", "xyz", "0 0 0")
+    roll_pitch_yaw = triple(path, joint, "origin", "rpy", "0 0 0")
+    return euler_zyx_to_matrix(roll_pitch_yaw.flip(-1)), triple(path, joint, "origin", "xyz", "0 0 0")
 
 
-def _axis(path: str, joint: Element) -> list[float]:
-    axis = _triple(path, joint, "axis", "xyz", "1 0 0")
+def axis_of(path: str, joint: Element) -> list[float]:
+    """Direction of the axis of a joint of a URDF, of length 1."""
+    axis = triple(path, joint, "axis", "xyz", "1 0 0")
     if axis.norm() == 0:
         raise InputError(f"{path}: joint '{joint.get('name', '?')}' has the axis 0 0 0; give its direction")
     values: list[float] = (axis / axis.norm()).tolist()

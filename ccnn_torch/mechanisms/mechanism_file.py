@@ -154,7 +154,8 @@ def urdf_text(arm: SerialArm) -> str:
     from ours in its last digit. Limits are those that joints are sampled from; URDF wants an effort and a speed, which
     a calibration does not know and which are written as 0.
     """
-    origins, last = _chain(arm)
+    base, origins, last = chain_of(arm)
+    origins[0] = compose(base, origins[0])
     root = Element("robot", name=visible(arm.name))
     names = ["base_link", *(f"link{i + 1}" for i in range(len(origins))), "tool"]
     for name in names:
@@ -175,7 +176,8 @@ def mjcf_text(arm: SerialArm) -> str:
 
     MuJoCo wants masses, which a calibration does not know: each link has 1 kg and 0.01 kg m², without gravity.
     """
-    origins, last = _chain(arm)
+    base, origins, last = chain_of(arm)
+    origins[0] = compose(base, origins[0])
     root = Element("mujoco", model=visible(arm.name))
     SubElement(root, "compiler", angle="radian", autolimits="true")
     SubElement(root, "option", gravity="0 0 0")
@@ -194,8 +196,8 @@ def mjcf_text(arm: SerialArm) -> str:
 _Frame = tuple[Tensor, Tensor]
 
 
-def _chain(arm: SerialArm) -> tuple[list[_Frame], _Frame]:
-    """Fixed transforms before each joint's motion, base included, and behind the last, tool included."""
+def chain_of(arm: SerialArm) -> tuple[_Frame, list[_Frame], _Frame]:
+    """Base; fixed transforms before each joint's motion; and that behind the last, tool included."""
     n = len(arm.joints)
     values = arm.nominal
     links = arm.links(values)
@@ -204,11 +206,10 @@ def _chain(arm: SerialArm) -> tuple[list[_Frame], _Frame]:
     fixed = [(rotations[i], translations[i]) for i in range(n)]
     base = rotation_vector_to_matrix(values[3:6]), values[:3]
     tool = rotation_vector_to_matrix(values[-3:]), values[-6:-3]
-    if arm._axis_before:
-        origins, last = [base, *fixed[:-1]], compose(fixed[-1], tool)
-    else:
-        origins, last = [compose(base, fixed[0]), *fixed[1:]], tool
-    return origins, last
+    if not arm._axis_before:
+        return base, fixed, tool
+    none = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    return base, [none, *fixed[:-1]], compose(fixed[-1], tool)
 
 
 def _placed(frame: _Frame) -> dict[str, str]:

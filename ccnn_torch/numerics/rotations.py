@@ -8,6 +8,7 @@ Warning:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -72,6 +73,14 @@ def matrix_to_euler_zyx(matrix: Tensor) -> Tensor:
     pitch = torch.atan2(-g, cosine * a + sine * d)
     roll = torch.atan2(sine * c - cosine * f, cosine * e - sine * b)
     return torch.stack([yaw, pitch, roll], -1)
+
+
+def nearest_euler(angles: Sequence[float], wanted: Sequence[float]) -> list[float]:
+    """Of the ways to write a rotation by three angles, full turns among them, the one nearest to another, `3` [rad]."""
+    first, middle, last = angles
+    ways = ((first, middle, last), (first + math.pi, math.pi - middle, last + math.pi))
+    near = [[w + math.remainder(a - w, 2 * math.pi) for a, w in zip(way, wanted, strict=True)] for way in ways]
+    return min(near, key=lambda way: math.dist(way, wanted))
 
 
 def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
+from ccnn_torch.mechanisms.kinds.machine_file import template
 from ccnn_torch.mechanisms.mechanism_file import mechanism_text
 from ccnn_torch.training import Scaling
 
@@ -117,6 +118,51 @@ def test_tables_of_single_axes_where_one_suffices() -> None:
     assert float(mesh["min_x"]) == pytest.approx(1e3 * float(low[0]))
 
 
+# In the form of https://infosys.beckhoff.com, TF5200 axis compensation, "Example of a compensation value list", and of
+# https://www.isg-stuttgart.de/fileadmin/kernel/kernel-html/en-GB/296429067.html.
+SSFK_SAMPLE = (
+    "kopf.log_achs_nr      2\nkw.ssfk.unit    1\nkw.ssfk.table[0].setpoint   -200000\nkw.ssfk.table[0].pos   24\n"
+)
+ISG_SAMPLE = "// Comment.\nX      EXX    EYX\n0.0    0.02   0.01\n10.0   0.00   -0.1\n"
+
+
+def read_ssfk(text: str) -> dict[str, str]:
+    return dict(line.split() for line in text.splitlines())
+
+
+def read_isg(text: str) -> tuple[list[str], np.ndarray]:
+    header, *rows = (line.split() for line in text.splitlines() if not line.startswith("//"))
+    return header, np.array(rows, float)
+
+
+def test_beckhoff_has_both_directions_of_an_axis_and_the_grid_of_a_gantry(tmp_path: Path) -> None:
+    assert read_ssfk(SSFK_SAMPLE)["kw.ssfk.table[0].pos"] == "24"
+    assert read_isg(ISG_SAMPLE)[0] == ["X", "EXX", "EYX"] and read_isg(ISG_SAMPLE)[1][1, 2] == -0.1
+    tables = print_tables(with_backlash(together=False), None)
+    entries = read_ssfk(tables["beckhoff_axis_q2.lis"])
+    count = int(entries["kw.ssfk.kw_nr_max"])
+    screw = np.array([[float(v) for v in line.split()] for line in tables["linuxcnc_q2.comp"].splitlines()])
+    found = [[int(entries[f"kw.ssfk.table[{i}].{k}"]) for k in ("setpoint", "pos", "neg")] for i in range(count)]
+    # Actual less commanded in 0.1 um, where LinuxCNC has what is added [mm].
+    np.testing.assert_allclose(1e-4 * np.array(found) * [1, -1, -1], screw, atol=6e-5)
+    assert entries["kopf.log_achs_nr"] == "2" and entries["kw.ssfk.unit"] == entries["kw.ssfk.bilateral"] == "1"
+    (tmp_path / "gantry.yaml").write_text(template("gantry").replace("base_frame: unknown", "base_frame: identity"))
+    nominal = load_mechanism(str(tmp_path / "gantry.yaml"))
+    values = dict(zip((p.name for p in nominal.geometry), nominal.nominal.tolist(), strict=True))
+    changed = values | {"lead_x": 3e-4, "squareness_xy": -4e-4, "squareness_yz": 5e-4}
+    real = nominal.with_nominal(torch.tensor([*changed.values()], dtype=torch.float64))
+    (tmp_path / "identified.yaml").write_text(mechanism_text(real, values))
+    files = export_model(tmp_path / "identified.yaml", "beckhoff", tmp_path / "out")
+    header, rows = read_isg(files["beckhoff_grid.csv"].read_text())
+    assert header == ["X", "Y", "Z", "EXX", "EYX", "EZX"] and len(rows) < 2000
+    x, y, z = rows[:, :3].T
+    # Written out: the true place less the commanded one.
+    wanted = np.stack([3e-4 * x - 4e-4 * y, 5e-4 * z, 0 * z], -1)
+    np.testing.assert_allclose(rows[:, 3:], wanted, atol=5e-4)
+    readme = files["README.md"].read_text()
+    assert "`file_format[0] ISG_CSV`" in readme and "beckhoff_grid.csv`: X, Y, Z, linear between the points" in readme
+
+
 def with_backlash(together: bool) -> Compensator:
     machine = load_mechanism("delta_linear")
     generator = torch.Generator().manual_seed(3)
@@ -171,7 +217,7 @@ def test_identified_links_go_back_into_a_simulator(tmp_path: Path, cli: Cli) -> 
     about = fields() | {"mechanism": arm.describe()}
     path = save_model(tmp_path, made, about, forms=("safetensors",))["safetensors"]
     assert cli("export", path, "--to", "urdf", "--out", tmp_path / "robot")[0] == 0
-    assert {p.name for p in (tmp_path / "robot").iterdir()} == {"robot.urdf", "robot.xml", "robot.yaml"}
+    assert {p.name for p in (tmp_path / "robot").iterdir()} == {"robot.urdf", "robot.xml", "robot.yaml", "README.md"}
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot" / "robot.xml"))
     data, site = mujoco.MjData(model), 0
     # The tool's rotation is not determined by positions: that of the model counts.
@@ -216,7 +262,7 @@ def test_what_cannot_be_exported_says_so(tmp_path: Path, cli: Cli) -> None:
     path = save_model(tmp_path, tripod_compensator(), fields(), forms=("safetensors",))["safetensors"]
     for to, sentence in (
         ("urdf", "no identified links of an arm"),
-        ("matlab", "there is no target 'matlab'; there are c99, st, linuxcnc, onnx, urdf, table"),
+        ("matlab", "there is no target 'matlab'; there are c99, st, linuxcnc, onnx, "),
     ):
         code, _, err = cli("export", path, "--to", to, "--out", tmp_path / "out")
         assert code == 2 and sentence in err and "Traceback" not in err

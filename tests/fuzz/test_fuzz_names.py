@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import math
 import re
 import shutil
 import subprocess
@@ -23,9 +25,11 @@ from test_targets import STRICT
 from ccnn_torch import export_model
 from ccnn_torch.compensation import Compensator, save_model
 from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
+from ccnn_torch.mechanisms.mechanism_file import mechanism_text
 
 pytestmark = pytest.mark.fuzz
 CASES = 1
@@ -39,6 +43,9 @@ TOKENS = [
     *(".so x", "in", "[m]", "]("),
 ]
 names = st.lists(st.one_of(st.sampled_from(TOKENS), st.text(max_size=3)), min_size=1, max_size=6).map("".join)
+HALF = math.pi / 2
+UR10 = [[0, HALF, 0.1273, 0], [-0.612, 0, 0, 0], [-0.5723, 0, 0, 0], [0, HALF, 0.163941, 0], [0, -HALF, 0.1157, 0]]
+UR10.append([0, 0, 0.0922, 0])
 CODE = "*/void __attribute__((constructor,weak))f(){for(;;);}/*"
 WORSE = '*)??/\n*\\\n/";;\n(*<a>`|\x00\u202e../=1'
 
@@ -63,8 +70,16 @@ def exported(folder: Path, machine: str, joints: list[str], more: list[str], uni
     about = fields() | {"mechanism": arm.describe() | {"name": machine, "keys": keys}}
     links = save_model(folder / "links", on_arm, about, forms=("safetensors",))["safetensors"]
     found = {}
-    for to, path in (("c99", model), ("st", model), ("linuxcnc", model), ("table", model), ("urdf", links)):
-        for name, file in export_model(path, to, folder / to).items():
+    # Files of numbers: of an arm of that name, as a file may have it, for motors of such names.
+    turning = SerialArm(visible(machine), "standard", UR10)
+    before = dict(zip((p.name for p in turning.geometry), turning.nominal.tolist(), strict=True))
+    numbers, current = folder / "arm.yaml", folder / "calibration.json"
+    numbers.write_text(mechanism_text(turning, before), encoding="utf-8")
+    motor = {"id": 1, "drive_mode": 0, "homing_offset": 1, "range_min": 0, "range_max": 4095}
+    current.write_text(json.dumps({name: motor for name in (*joints, *more, machine, *"abcdef")}), encoding="utf-8")
+    orders = {"c99": model, "st": model, "linuxcnc": model, "table": model, "urdf": links, "ros2_control": model}
+    for to, path in (orders | dict.fromkeys(("ur", "linuxcnc_hal", "lerobot"), numbers)).items():
+        for name, file in export_model(path, to, folder / to, current=current if to == "lerobot" else None).items():
             assert file.parent == folder / to and re.fullmatch(r"\w+\.\w+|Makefile", file.name, re.ASCII)
             found[f"{to}/{name}"] = file.read_text(encoding="utf-8")
     return found
@@ -100,8 +115,12 @@ def test_names_are_never_code(fresh: Any, machine: str, joints: list[str], more:
             # Two inputs of one name.
             assert {*joints} & {*more}
             return
-        for name in ("selftest.c", "Makefile", "compensator.c"):
-            assert found[f"c99/{name}"] == wanted[f"c99/{name}"]
+        for name in ("c99/selftest.c", "c99/Makefile", "c99/compensator.c", "ros2_control/compensator.c"):
+            assert found[name] == wanted[name]
+        for name in ("package.xml", "plugin.xml", "controllers.yaml", "CMakeLists.txt"):
+            assert found[f"ros2_control/{name}"] == wanted[f"ros2_control/{name}"]
+        controller, plain = (text["ros2_control/compensation.cpp"].partition("*/") for text in (found, wanted))
+        assert controller[2] == plain[2] and controller[0].count("/*") == 1
         for compiler in COMPILERS:
             sources = [str(folder / "c99" / name) for name in ("selftest.c", "compensator.c")]
             subprocess.run([compiler, *STRICT, "-fsyntax-only", *sources], check=True)
@@ -111,9 +130,12 @@ def test_names_are_never_code(fresh: Any, machine: str, joints: list[str], more:
         component(found["linuxcnc/ccnnkins.comp"], wanted["linuxcnc/ccnnkins.comp"], folder)
         header, *rows = csv.reader(found["table/table.csv"].splitlines())
         assert len(header) == 4 and {len(row) for row in rows} == {4} and not {h[0] for h in header} & {*"=+-@\t"}
+        for name in ("ur/kinematics.yaml", "linuxcnc_hal/kinematics.hal"):
+            assert found[name] == wanted[name]
+        assert [*json.loads(found["lerobot/calibration.json"])][:4] == [*dict.fromkeys((*joints, *more, machine))][:4]
         for text in (value for name, value in found.items() if name.endswith(".md")):
             assert "<" not in text and text.isprintable() is False and text.isascii()
-            assert all(line.count("`") % 2 == 0 and line.count("|") in (0, 6) for line in text.splitlines())
+            assert all(line.count("`") % 2 == 0 and line.count("|") in (0, 4, 6) for line in text.splitlines())
         for name, key in (("robot.urdf", "name"), ("robot.xml", "model")):
             tree = ElementTree.fromstring(found[f"urdf/{name}"])
             assert tree.get(key) == parse_yaml(found["urdf/robot.yaml"], "robot.yaml")["robot"]

@@ -15,53 +15,23 @@ from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of
 from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
 from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
+from ccnn_torch.compensation.targets.lowered import Found, Stack, with_readme
+from ccnn_torch.compensation.targets.machines import print_hal, print_klipper
 from ccnn_torch.compensation.targets.onnx_export import export_onnx
+from ccnn_torch.compensation.targets.robots import print_lerobot, print_pal, print_robot, print_ur
+from ccnn_torch.compensation.targets.ros2_control import middle_of, offsets_alone, print_ros2_control
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.compensation.targets.table import print_tables
-from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
+from ccnn_torch.display import plain
+from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
-from ccnn_torch.mechanisms.mechanism_file import dh_text, mjcf_text, urdf_text
+from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
 
 DTYPES = ("float64", "float32")
 # What a controller needs: without the way back and the standard deviation a graph takes three quarters of the time.
 COMMAND = ("command", "deviation", "inside_domain", "status")
-
-
-def print_robot(model: LoadedModel) -> dict[str, str]:
-    """Contents of the files by name: `robot.urdf`, `robot.xml` (MJCF), and `robot.yaml` where the arm has a DH table.
-
-    Raises:
-        MethodFailedError: the model has no identified links, or its machine is no serial arm.
-    """
-    arm = _arm(model)
-    if arm.drives:
-        raise MethodFailedError(
-            f"a URDF has no key for the leads and couplings of '{arm.name}'; export c99, st or onnx"
-        )
-    texts = {"robot.urdf": urdf_text(arm), "robot.xml": mjcf_text(arm)}
-    return texts if arm.convention == "urdf" else texts | {"robot.yaml": dh_text(arm)}
-
-
-def _arm(model: LoadedModel) -> SerialArm:
-    if model.machine is not None:
-        arm = model.machine.identified
-        if isinstance(arm, SerialArm):
-            return arm
-        raise MethodFailedError(
-            f"a URDF is a tree, and '{arm.name}' is no serial arm; its parameters are in identified.yaml"
-        )
-    machine = None if model.compensator is None else model.compensator.machine
-    if machine is None or not isinstance(machine.mechanism, SerialArm):
-        raise MethodFailedError(
-            "this model has no identified links of an arm to write; train with geometry=identify, or give the "
-            "identified.yaml of ccnn identify"
-        )
-    arm = machine.real
-    assert isinstance(arm, SerialArm)
-    return arm
 
 
 @dataclass
@@ -73,6 +43,18 @@ class _Order:
     dtype: str
     sd: bool
     allow_code: bool
+    current: Path | None = None
+    said: str = ""
+
+    def written(self, make: Callable[[Found], Stack], title: str) -> dict[str, str]:
+        """Numbers of a stack with their README.md."""
+        found = self.found
+        files, self.said = with_readme(make(found), found, f"{title} of {plain(found.nominal.name)}")
+        return files
+
+    @property
+    def found(self) -> Found:
+        return Found(self.model, self.current, self.allow_code)
 
     def compensator(self) -> Compensator:
         if self.model.compensator is None:
@@ -129,14 +111,34 @@ def _table(order: _Order) -> dict[str, str]:
     return print_tables(order.compensator(), order.mechanism() if known else None)
 
 
+def _ros2_control(order: _Order) -> Mapping[str, str]:
+    if order.dtype != "float64":
+        raise InputError("ros2_control computes in double; leave out --dtype float32")
+    found = order.found
+    offsets, said = offsets_alone(found)
+    if offsets is not None:
+        return order.written(lambda _: offsets, "Zeros of the joints")
+    return print_ros2_control(*order.proven(), middle_of(found), said)
+
+
 TARGETS: dict[str, Callable[[_Order], Mapping[str, str | bytes]]] = {
     "c99": lambda order: print_c99(*order.proven()),
     "st": lambda order: print_structured_text(*order.proven()),
     "linuxcnc": _linuxcnc,
     "onnx": _onnx,
-    "urdf": lambda order: print_robot(order.model),
+    "ros2_control": _ros2_control,
     "table": _table,
+    "beckhoff": _table,
+    "urdf": lambda order: order.written(print_robot, "Links"),
+    "mjcf": lambda order: order.written(print_robot, "Links"),
+    "ur": lambda order: order.written(print_ur, "Kinematics"),
+    "pal": lambda order: order.written(print_pal, "Calibration"),
+    "klipper": lambda order: order.written(print_klipper, "Kinematics"),
+    "linuxcnc_hal": lambda order: order.written(print_hal, "Kinematics"),
+    "lerobot": lambda order: order.written(print_lerobot, "Calibration"),
 }
+CURRENT = ("ur", "pal", "lerobot", "klipper")
+"""Those that take names or numbers from the user's own file."""
 
 
 def export_model(
@@ -147,37 +149,54 @@ def export_model(
     sd: bool = False,
     public_key: str | Path | None = None,
     allow_code: bool = False,
+    current: str | Path | None = None,
 ) -> dict[str, Path]:
-    """Write a model as source code, table or file of a controller or simulator.
+    """Write a model as source code, table or file of a controller, robot or simulator.
 
     Args:
-        path: a .safetensors file, or an identified.yaml.
-        to: `c99`, `st` (IEC 61131-3 Structured Text), `linuxcnc` (kinematics component), `onnx`, `urdf` (with MuJoCo
-            model and DH table), or `table` (error tables).
+        path: a .safetensors file, an identified.yaml or a diagnosis.json.
+        to: a target of `TARGETS`, see `ccnn export --help`.
         out: folder; made where it is not there.
         dtype: `float64` or `float32`, in which the controller computes.
         sd: with a function for the standard deviation of the deviation.
         public_key, allow_code: as `load_model`.
+        current: the user's own file of a stack, from which names and numbers are taken that a machine does not have.
 
     Returns:
         The files by name.
 
     Raises:
-        InputError: the target or the type is unknown.
+        InputError: the target or the type is unknown, or the current file is missing or of another form.
         ModelFileError: the file is no master of a model.
         MethodFailedError: the model cannot be expressed so, or single precision does not hold it.
         WriteError: a file cannot be written.
     """
+    return export_told(path, to, out, dtype, sd, public_key, allow_code, current)[0]
+
+
+def export_told(
+    path: str | Path,
+    to: str,
+    out: str | Path,
+    dtype: str = "float64",
+    sd: bool = False,
+    public_key: str | Path | None = None,
+    allow_code: bool = False,
+    current: str | Path | None = None,
+) -> tuple[dict[str, Path], str]:
+    """As `export_model`, and what the files leave of the machine's error; empty where they hold all of the model."""
     for value, known, what in ((to, [*TARGETS], "target"), (dtype, DTYPES, "dtype")):
         if value not in known:
             near = nearest(value, known)
             hint = f" (did you mean '{near}'?)" if near else ""
             raise InputError(f"there is no {what} '{value}'{hint}; there are {', '.join(known)}")
+    if current is not None and to not in CURRENT:
+        raise InputError(f"--current: is read by the targets {', '.join(CURRENT)}, not by {to}; leave it out")
     model = load_compensation(path, public_key=public_key, allow_code=allow_code)
-    order = _Order(Path(path), model, dtype, sd, allow_code)
+    order = _Order(Path(path), model, dtype, sd, allow_code, None if current is None else Path(current))
     folder = Path(out)
     # Printed before anything is written: a target may find that it lacks an operation.
     contents = TARGETS[to](order)
     for name, content in contents.items():
         write_whole(folder / name, content)
-    return {name: folder / name for name in contents}
+    return {name: folder / name for name in contents}, order.said

@@ -14,7 +14,8 @@ from torch import Tensor
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.display import identifiers, plain
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 Array = NDArray[Any]
 
@@ -24,6 +25,8 @@ _CHECKED, _FEWEST = 2000, 50
 # What one axis alone must explain of its own deviation, by RMS, so that its table is worth having.
 _SUFFICES = 0.2
 _MESH = 9
+# Points along an axis of a grid for a controller that takes 2000; and how far its axes may be from x, y, z [1].
+_RECORDS, _ALIGNED = 12, 0.05
 _NAMES = {"m": ("mm", 1e3), "rad": ("deg", 180 / np.pi)}
 
 
@@ -71,9 +74,18 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
             lost.append(f"{_rms(both[0] - both[1]) / 2 * scale:.3g} {name} of `{plain(joint.name)}`")
         if share <= _SUFFICES:
             tables[f"linuxcnc_{files[j]}.comp"] = _screw(line * scale, *own * scale)
+            tables[f"beckhoff_axis_{files[j]}.lis"] = _ssfk(j + 1, files[j], joint.unit, line, *own)
             tables[f"heidenhain_{files[j]}.com"] = _heidenhain(files[j], name, line * scale, *own * scale)
     axes = "| joint | deviation, RMS | left by its own table, RMS | at most | one axis suffices |\n"
     told.append(axes + "| --- | --- | --- | --- | --- |\n" + "\n".join(rows))
+    if mechanism is not None and _is_cartesian(mechanism):
+        lines = [np.linspace(a, b, _RECORDS) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
+        values = _deviation(compensator, grid.reshape(-1, n), middle).reshape(grid.shape)
+        tables["beckhoff_grid.csv"] = _isg(grid.reshape(-1, n), values.reshape(-1, n))
+        told.append(
+            _said("beckhoff_grid.csv", "X, Y, Z, linear between the points", truth, _between(lines, values, checked))
+        )
     if mechanism is not None and [c.name for c in mechanism.pose] == ["x", "y", "z"]:
         tables["klipper_mesh.cfg"], sentence = _mesh(compensator, mechanism)
         told.append(sentence)
@@ -103,6 +115,13 @@ _FORMS = {
     "manuals. The axis has the deviation as it is in the positive direction of traverse, BACKLASH what the negative "
     "direction adds to it. It was not tried on a control, so check the signs with one point in both directions, and in "
     "the control's manual whether its BACKLASH is this difference.",
+    "beckhoff_grid": "`beckhoff_grid.csv` is an error parameter file of the volumetric compensation (TF5280): "
+    "`file[0] ...\\beckhoff_grid.csv`, `file_format[0] ISG_CSV` in its list, and `vol_comp[0].max_records 2000` in "
+    "hochlauf.lis. It has the errors of the place over X, Y and Z as EXX, EYX, EZX [mm], what the machine is beyond "
+    "the command; angles are not in it. Check the sign with one point: `negate` turns it.",
+    "beckhoff_axis": "`beckhoff_axis_JOINT.lis`: an axis compensation list (`kw.ssfk`, 0.1 um or 0.0001 deg, actual "
+    "less commanded, in both directions) of TwinCAT CNC and ISG kernels; write the number of your axis into "
+    "`kopf.log_achs_nr`, and activate it by `lr_param.ssfk 1`.",
     "klipper": "`klipper_mesh.cfg` is a saved profile of `[bed_mesh]` for the section SAVE_CONFIG of printer.cfg.",
 }
 
@@ -181,6 +200,32 @@ def _csv(compensator: Compensator, grid: Array, values: Array) -> str:
 def _screw(line: Array, up: Array, down: Array) -> str:
     """Nominal position and what is added to it, forward and back."""
     return "".join(f"{x:.6f} {-d:.6f} {-e:.6f}\n" for x, d, e in zip(line, up, down, strict=True))
+
+
+def _ssfk(number: int, joint: str, unit: str, line: Array, up: Array, down: Array) -> str:
+    """Commanded position, and what the axis is beyond it forward and back [0.1 um or 0.0001 deg]."""
+    scale = 1e7 if unit == "m" else 1e4 * 180 / np.pi
+    head = {"kopf.log_achs_nr": number, "kopf.log_achs_name": joint.upper(), "kw.ssfk.interval": 0}
+    head |= {"kw.ssfk.kw_startpos": round(line[0] * scale), "kw.ssfk.kw_nr_max": len(line), "kw.ssfk.unit": 1}
+    head |= {"kw.ssfk.bilateral": 1}
+    for key, values in (("setpoint", line), ("pos", up), ("neg", down)):
+        head |= {f"kw.ssfk.table[{i}].{key}": round(float(v) * scale) for i, v in enumerate(values)}
+    return "".join(f"{key:<36}{value}\n" for key, value in head.items())
+
+
+def _is_cartesian(mechanism: Mechanism) -> bool:
+    """Whether joints are x, y and z, so that what they are off by is where the tool is off."""
+    if [j.unit for j in mechanism.joints] != ["m"] * 3 or [c.name for c in mechanism.pose][:3] != ["x", "y", "z"]:
+        return False
+    slope = mechanism.jacobian(mechanism.home_joints)[:3]
+    if isinstance(mechanism, SerialArm):
+        slope = rotation_vector_to_matrix(mechanism.nominal[3:6]).mT @ slope
+    return bool((slope - torch.eye(3, dtype=slope.dtype)).abs().max() < _ALIGNED)
+
+
+def _isg(grid: Array, values: Array) -> str:
+    rows = "".join(" ".join(f"{v:.6f}" for v in row) + "\n" for row in 1e3 * np.hstack([grid, values]))
+    return f"// Errors of the place [mm] over the commanded axes [mm].\nX Y Z EXX EYX EZX\n{rows}"
 
 
 def _heidenhain(joint: str, unit: str, line: Array, up: Array, down: Array) -> str:

@@ -1,0 +1,172 @@
+"""Positions of KRL (KUKA) and RAPID (ABB): each stands for itself, wherever it is in the text."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ccnn_torch.compensation.programs.text import NUMBER, Array, Edit, Point, edited, lines_of, masked, number_like
+from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_quaternion, nearest_euler
+
+_REAL = rf"{NUMBER}(?:[eE][-+]?\d+)?"
+
+
+@dataclass
+class Literal:
+    """A position and where its numbers stand: x, y, z, orientation, or joints.
+
+    Attributes:
+        spans: of its numbers in the text; empty where it cannot be changed.
+        units: of each.
+    """
+
+    point: Point
+    spans: Sequence[tuple[int, int]] = ()
+    units: Sequence[str] = ()
+
+
+class Literals:
+    """A program whose positions are literals.
+
+    Attributes:
+        points: in the order of the text.
+    """
+
+    def __init__(self, text: str, found: Sequence[Literal]) -> None:
+        self._text, self._found = text, found
+        self.points = [literal.point for literal in found]
+        self.notes: list[str] = []
+
+    def written(self, changed: Sequence[Array | None]) -> tuple[str, list[Array | None]]:
+        """The text with other positions, frames or joints as they are in `points`, and what then stands there.
+
+        changed: None of those that stay.
+        """
+        edits, stands = [], list[Array | None]()
+        for literal, value in zip(self._found, changed, strict=True):
+            if value is None:
+                stands.append(None)
+                continue
+            old = [self._text[a:b] for a, b in literal.spans]
+            numbers = self._numbers(value, [float(v) for v in old], literal.point.frame is not None)
+            new = [number_like(*each) for each in zip(numbers, old, literal.units, strict=True)]
+            edits += [Edit(a, b, text) for (a, b), text in zip(literal.spans, new, strict=True)]
+            there = [float(v) for v in new]
+            stands.append(self._frame(there) if literal.point.frame is not None else np.radians(there))
+        return edited(self._text, edits), stands
+
+    def _numbers(self, value: Array, old: Sequence[float], is_frame: bool) -> list[float]:
+        if not is_frame:
+            return [math.degrees(v) for v in value]
+        return [*(1e3 * value[:3, 3]).tolist(), *self._turn(value[:3, :3], old[3:])]
+
+    def _turn(self, rotation: Array, old: Sequence[float]) -> list[float]:
+        raise NotImplementedError
+
+    def _frame(self, numbers: Sequence[float]) -> Array:
+        raise NotImplementedError
+
+
+class Krl(Literals):
+    """KRL: frames {X .., Y .., Z .., A .., B .., C ..} [mm, deg], R = Rz(A) Ry(B) Rx(C); axes {A1 .., A2 ..} [deg].
+
+    Frames of bases and tools are no positions.
+    """
+
+    def __init__(self, text: str) -> None:
+        shown, line_of = masked(text, r'"[^"\r\n]*"|;[^\r\n]*'), lines_of(text)
+        found = []
+        for group in re.finditer(r"\{([^{}]*)\}", shown):
+            entries = {
+                entry[1].upper(): (group.start(1) + entry.start(2), group.start(1) + entry.end(2), entry[2])
+                for entry in re.finditer(r"\b([A-Za-z]\w*)[ \t]+([^,]*[^,\s])", group[1])
+            }
+            before = shown[: group.start()].rpartition("\n")[2]
+            behind = shown[group.end() : group.end() + 40].lstrip(" \t")
+            if not entries.keys() & {"X", "Y", "Z", "A1"} or re.search(_NO_POSITION, before, re.IGNORECASE):
+                continue
+            axes = "A1" in entries
+            names = [f"A{i}" for i in range(1, 7) if f"A{i}" in entries] if axes else list("XYZABC")
+            line, spans = line_of(group.start()), [entries.get(name, (0, 0, ""))[:2] for name in names]
+            left = ""
+            if any(not re.fullmatch(_REAL, entries.get(name, (0, 0, ""))[2]) for name in names):
+                left = "not all of its numbers are there"
+            elif re.match(r"\s*\w*_REL\b", before, re.IGNORECASE):
+                left = "a relative motion"
+            elif behind.startswith(":") or re.search(_SHIFTED, before, re.IGNORECASE):
+                left = "a shift of another frame"
+            if left:
+                found.append(Literal(Point(line, left=left)))
+                continue
+            values = [float(entries[name][2]) for name in names]
+            point = Point(line, joints=np.radians(values)) if axes else Point(line, self._frame(values))
+            found.append(Literal(point, spans, ["deg"] * len(names) if axes else ["mm"] * 3 + ["deg"] * 3))
+        super().__init__(text, found)
+
+    def _turn(self, rotation: Array, old: Sequence[float]) -> list[float]:
+        angles = matrix_to_euler_zyx(torch.from_numpy(np.array(rotation))).tolist()
+        return [math.degrees(angle) for angle in nearest_euler(angles, np.radians(old).tolist())]
+
+    def _frame(self, numbers: Sequence[float]) -> Array:
+        return _frame_of(numbers[:3], euler_zyx_to_matrix(torch.tensor(np.radians(numbers[3:]))).numpy())
+
+
+# Variables of the controller, and declarations of frames, which are bases and tools.
+_NO_POSITION = (
+    r"(\$\w+(\[[^\]]*\])?|\w*(BASE|TOOL|MACHINE|LOAD)\w*_DATA\[[^\]]*\])\s*=\s*$|\bFRAME\b[^=]*=\s*$|\bFRAME\s*:\s*$"
+)
+_SHIFTED = r"(?<!\bPOS)(?<!\bE6POS)(?<!\bAXIS)(?<!\bE6AXIS):\s*$"
+
+
+class Rapid(Literals):
+    """RAPID: robtarget [[x,y,z],[q1..q4],[..],[..]] [mm, 1], jointtarget [[6 axes],[6 external]] [deg]."""
+
+    def __init__(self, text: str) -> None:
+        shown, line_of = masked(text, r'"[^"\r\n]*"|![^\r\n]*'), lines_of(text)
+        found = []
+        for group in re.finditer(rf"\[\s*{_LIST}\s*,\s*{_LIST}(\s*,\s*{_LIST}\s*,\s*{_LIST})?\s*\]", shown):
+            lists = [group.span(k) for k in (1, 2)]
+            spans = [
+                (start + entry.start(), start + entry.end())
+                for start, end in (lists if group[3] else lists[:1])
+                for entry in re.finditer(r"[^,\s][^,]*?(?=\s*(?:,|$))", shown[start:end])
+            ]
+            texts = [shown[a:b] for a, b in spans]
+            # A pose alone is of a tool or work object.
+            if not group[3] and (len(texts) != 6 or group[2].count(",") != 5):
+                continue
+            line = line_of(group.start())
+            if len(texts) != (7 if group[3] else 6) or not all(re.fullmatch(_REAL, v) for v in texts):
+                found.append(Literal(Point(line, left="not all of its numbers are there")))
+                continue
+            values = [float(v) for v in texts]
+            point = Point(line, self._frame(values)) if group[3] else Point(line, joints=np.radians(values))
+            found.append(Literal(point, spans, ["mm"] * 3 + ["1"] * 4 if group[3] else ["deg"] * 6))
+        super().__init__(text, found)
+
+    def _turn(self, rotation: Array, old: Sequence[float]) -> list[float]:
+        quaternion = matrix_to_quaternion(torch.from_numpy(rotation.copy())).numpy()
+        return [math.copysign(1.0, float(quaternion @ np.array(old))) * float(v) for v in quaternion]
+
+    def _frame(self, numbers: Sequence[float]) -> Array:
+        w, x, y, z = np.array(numbers[3:]) / np.linalg.norm(numbers[3:])
+        turn = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        return _frame_of(numbers[:3], np.array(turn))
+
+
+_LIST = r"\[([^\[\]]*)\]"
+
+
+def _frame_of(place: Sequence[float], rotation: Array) -> Array:
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = rotation, 1e-3 * np.array(place)
+    return found

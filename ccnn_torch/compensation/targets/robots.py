@@ -1,0 +1,307 @@
+"""Identified arms for ROS, PAL robots, LeRobot and simulators: numbers in the files that these read."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from ccnn_torch.compensation.targets.lowered import (
+    Array,
+    Chain,
+    Found,
+    Stack,
+    arm_of,
+    chain,
+    matrix,
+    nearest_on,
+    of_rpy,
+    place_of,
+    rpy,
+    told_frame,
+    written,
+    zeros_of,
+)
+from ccnn_torch.display import plain, visible
+from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.files.read import CONFIG_LIMIT, parse_json, read_text, read_xml
+from ccnn_torch.files.yaml_file import parse_yaml
+from ccnn_torch.mechanisms import SerialArm
+from ccnn_torch.mechanisms.dh_file import URDF_LIMIT, axis_of, link_of, triple
+from ccnn_torch.mechanisms.mechanism_file import chain_of, dh_text, mjcf_text, urdf_text
+from ccnn_torch.numerics.rotations import nearest_euler
+
+_HALF = math.pi / 2
+
+
+def arm_in(found: Found) -> tuple[SerialArm, SerialArm]:
+    """The nominal and the identified arm.
+
+    Raises:
+        MethodFailedError: the machine is no serial arm.
+    """
+    nominal, identified = found.nominal, found.identified
+    if not isinstance(nominal, SerialArm) or not isinstance(identified, SerialArm):
+        raise MethodFailedError(
+            f"this format is of a serial arm, and '{nominal.name}' is none; its parameters are in identified.yaml"
+        )
+    return nominal, identified
+
+
+def print_robot(found: Found) -> Stack:
+    """`robot.urdf`, `robot.xml` (MJCF), and `robot.yaml` where the arm has a DH table.
+
+    Raises:
+        MethodFailedError: the model has no identified links, or its machine is no serial arm.
+    """
+    compensator = None if found.model.machine is not None else found.model.compensator
+    if found.model.machine is None and (compensator is None or compensator.machine is None):
+        raise MethodFailedError(
+            "this model has no identified links of an arm to write; train with geometry=identify, or give the "
+            "identified.yaml of ccnn identify"
+        )
+    arm = arm_in(found)[1]
+    chain(arm)
+    texts = {"robot.urdf": urdf_text(arm), "robot.xml": mjcf_text(arm)}
+    texts |= {} if arm.convention == "urdf" else {"robot.yaml": dh_text(arm)}
+    load = (
+        "`robot.urdf` is a chain `base_link` to `tool`; `robot.xml` loads with "
+        '`mujoco.MjModel.from_xml_path("robot.xml")`. Masses are 1 kg a link.'
+    )
+    return Stack(texts, arm, load)
+
+
+# UR arms: a2, a3, d4, d5, d6 [m], as in default_kinematics.yaml of ur_description.
+_UR = {
+    "ur3": (-0.24365, -0.21325, 0.11235, 0.08535, 0.0819),
+    "ur3e": (-0.24355, -0.2132, 0.13105, 0.08535, 0.0921),
+    "ur5": (-0.425, -0.39225, 0.10915, 0.09465, 0.0823),
+    "ur5e": (-0.425, -0.3922, 0.1333, 0.0997, 0.0996),
+    "ur10": (-0.612, -0.5723, 0.163941, 0.1157, 0.0922),
+    "ur10e": (-0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
+    "ur16e": (-0.4784, -0.36, 0.17415, 0.11985, 0.11655),
+    "ur20": (-0.862, -0.7287, 0.201, 0.1593, 0.1543),
+    "ur30": (-0.637, -0.5037, 0.201, 0.1593, 0.1543),
+}
+_UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+# How far axes may be from those of a type [m, rad]; types differ by 3 mm and more.
+_SAME = 1.5e-3
+
+
+def print_ur(found: Found) -> Stack:
+    """`kinematics.yaml` in the form of ur_description.
+
+    Raises:
+        MethodFailedError: the machine is no serial arm, or no UR.
+        InputError: the file that is there has no `kinematics`.
+    """
+    nominal, identified = arm_in(found)
+    kind, frames = _ur_frames(chain(nominal))
+    real = chain(identified)
+    fixed = frames[0] @ np.linalg.inv(of_rpy((0, 0, _height(frames)), (0, 0, 0)))
+    made = real.through(fixed, [nearest_on(*pair) for pair in zip(real.frames, frames, strict=True)])
+    lines = ["kinematics:"]
+    for name, m in zip(_UR_LINKS, made.origins, strict=True):
+        numbers = zip(("x", "y", "z", "roll", "pitch", "yaw"), [*place_of(m), *rpy(m)], strict=True)
+        lines += [f"  {name}:", *(f"    {key}: {written(value)}" for key, value in numbers)]
+    given = "ccnn_identified"
+    if found.current is not None:
+        current = parse_yaml(read_text(found.current, CONFIG_LIMIT), str(found.current))
+        inner = current.get("kinematics") if isinstance(current, dict) else None
+        if not isinstance(inner, dict) or not re.fullmatch(r"\w+", str(inner.get("hash"))):
+            raise InputError(f"{found.current}: has no kinematics.hash; give the file that ur_calibration wrote")
+        given = str(inner["hash"])
+    lines.append(f"  hash: {given}")
+    load = (
+        f"`ros2 launch ur_robot_driver ur_control.launch.py ur_type:={kind} robot_ip:=IP "
+        "kinematics_params_file:=$PWD/kinematics.yaml`, and the same argument for `ur_description` and MoveIt.\n\n"
+        "The driver compares `hash` with that of the robot and prints an error where they differ: give the file that "
+        "`ur_calibration` wrote as `--current`, whose hash is kept. The controller itself keeps its own numbers.\n\n"
+        f"Frames are no part of it. `base_link_inertia` in the frame of the measurement: {told_frame(made.base)}. "
+        f"The measured tool in `tool0`: {told_frame(made.last)} [m, rad]."
+    )
+    return Stack({"kinematics.yaml": "\n".join(lines) + "\n"}, arm_of(made, identified), load)
+
+
+def _height(frames: Sequence[Array]) -> float:
+    """d1: of the first two axes' crossing above the arm's own base [m]."""
+    return float(frames[0][2, 3])
+
+
+def _ur_frames(made: Chain) -> tuple[str, list[Array]]:
+    """The type of a UR, and the frames of its joints as ur_description has them, in the arm's own base.
+
+    The first two axes say where its base is; the others must be where those of the type are.
+    """
+    if len(made.origins) == 6:
+        first, second = made.frames[:2]
+        gap = np.linalg.inv(first) @ second
+        # x is across the first two axes, which meet.
+        x = np.cross(first[:3, 2], second[:3, 2])
+        size = float(np.linalg.norm(x))
+        up = second[:3, 3] - second[:3, 2] * float(_along(gap, first, second))
+        for kind, sizes in _UR.items() if size > 0.5 else ():
+            turned = np.stack([x / size, np.cross(first[:3, 2], x / size), first[:3, 2]], -1)
+            frames = [matrix(turned, up)]
+            for step in _ur_origins(*sizes):
+                frames.append(frames[-1] @ step)
+            if all(_apart(*pair) < _SAME for pair in zip(made.frames, frames, strict=True)):
+                return kind, frames
+    raise MethodFailedError(
+        f"this is no UR arm in its own count of the joints: its axes are none of those of {', '.join(_UR)}; export urdf"
+    )
+
+
+def _along(gap: Array, first: Array, second: Array) -> float:
+    """How far from the origin of the second frame, against its z, that axis is nearest to the first one [m]."""
+    flat = gap[:2, 2]
+    return float(flat @ gap[:2, 3] / (flat @ flat))
+
+
+def _ur_origins(a2: float, a3: float, d4: float, d5: float, d6: float) -> list[Array]:
+    turns = ((0, 0, 0, _HALF), (a2, 0, 0, 0), (a3, 0, d4, 0), (0, -d5, 0, _HALF), (0, d6, 0, -_HALF))
+    return [of_rpy(step[:3], (step[3], 0, 0)) for step in turns]
+
+
+def _apart(frame: Array, other: Array) -> float:
+    """How far two axes are apart, at the origin of the second, and by angle [m, rad]."""
+    gap = np.linalg.inv(frame) @ other
+    turned = math.hypot(gap[0, 2], gap[1, 2]) if gap[2, 2] > 0 else math.inf
+    return max(math.hypot(gap[0, 3], gap[1, 3]), turned)
+
+
+def print_pal(found: Found) -> Stack:
+    """`master_calibration.yaml`: what is added to the origins of the joints in the URDF of the robot.
+
+    Raises:
+        InputError: no URDF was given, or its joints are not those of the arm.
+        MethodFailedError: the machine is no serial arm.
+    """
+    nominal, identified = arm_in(found)
+    chain(identified)
+    if found.current is None:
+        raise InputError("--to pal names the joints of the robot: give its URDF as --current robot.urdf")
+    path, (base, _, tool) = str(found.current), chain_of(identified)
+    joints = _joints_of(path, nominal)
+    lines = ["robot_state_publisher:", "  geometric_calibration:"]
+    for joint, before, after in zip(joints, _plain(nominal), _plain(identified), strict=True):
+        xyz, angles = _origin(path, joint)
+        moved = of_rpy(xyz, angles) @ np.linalg.inv(before) @ after
+        turned = nearest_euler(rpy(moved), angles)
+        deltas = [a - b for a, b in zip([*place_of(moved), *turned], [*xyz, *angles], strict=True)]
+        name = str(joint.get("name")).removesuffix("_joint")
+        if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
+            raise InputError(
+                f"{path}: the name of joint '{visible(name)}' can be no key; ROS has letters, digits and _"
+            )
+        for suffix, delta in zip(("dx", "dy", "dz", "droll", "dpitch", "dyaw"), deltas, strict=True):
+            if abs(delta) > 1e-12:
+                lines.append(f"    {name}_{suffix}: {written(delta)}")
+    load = (
+        "Merge it into `/etc/calibration/master_calibration.yaml` on the robot and start it again; "
+        "`robot_state_publisher` adds the numbers to `xyz` and `rpy` of the joints' origins in the URDF [m, rad]. "
+        f"They were made for `{plain(found.current.name)}`.\n\nThe frame of the measurement "
+        f"({told_frame(matrix(*base))}) and the measured tool ({told_frame(matrix(*tool))} from the last joint) are no "
+        "part."
+    )
+    return Stack({"master_calibration.yaml": "\n".join(lines) + "\n"}, identified, load)
+
+
+def _plain(arm: SerialArm) -> list[Array]:
+    """Transforms before each joint's motion, in the arm's own frames."""
+    return [matrix(*(part.numpy() for part in origin)) for origin in chain_of(arm)[1]]
+
+
+def print_lerobot(found: Found) -> Stack:
+    """`calibration.json` with other `homing_offset`s.
+
+    Raises:
+        InputError: no calibration.json was given, or it is none.
+        MethodFailedError: the machine is no serial arm, or an offset is more than a motor takes.
+    """
+    arm = arm_in(found)[0]
+    if not bool(arm.revolute.all()):
+        raise MethodFailedError(f"lerobot counts turns of motors, and '{arm.name}' has joints that slide; export urdf")
+    path, n = found.current, len(arm.joints)
+    if path is None:
+        raise InputError("--to lerobot changes a calibration.json of LeRobot: give it as --current calibration.json")
+    motors = parse_json(read_text(path, CONFIG_LIMIT), str(path))
+    whole = isinstance(motors, dict) and all(
+        isinstance(m, dict) and all(isinstance(m.get(k), int) for k in ("homing_offset", "drive_mode"))
+        for m in motors.values()
+    )
+    if not whole or len(motors) < n:
+        raise InputError(
+            f"{path}: is no calibration.json of LeRobot with a motor for each of the {n} joints: "
+            '{"shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": …, "range_min": …, "range_max": …}, …}'
+        )
+    named = list(motors)[:n]
+    changed, rounded, rows = dict(motors), [], []
+    for name, zero in zip(named, zeros_of(found, arm), strict=True):
+        way = -1 if motors[name]["drive_mode"] else 1
+        counts = round(zero * way * _COUNTS / (2 * math.pi))
+        now = motors[name]["homing_offset"] - counts
+        if abs(now) > _MOST_COUNTS:
+            raise MethodFailedError(
+                f"{path}: homing_offset of {visible(name)} would be {now}; a motor takes {_MOST_COUNTS} at most: turn "
+                "the horn by a tooth and calibrate again"
+            )
+        changed[name] = motors[name] | {"homing_offset": now}
+        rounded.append(counts * way * 2 * math.pi / _COUNTS)
+        rows.append(f"`{plain(name)}` {-counts:+d}")
+    load = (
+        "Put it in the place of the file that you gave (`~/.cache/huggingface/lerobot/calibration/robots/`) and "
+        "answer with Enter when LeRobot asks whether to use it. Joints are the motors in the order of the file: "
+        f"{', '.join(rows)} counts of 4096 a turn. That is for Feetech motors, whose present position is the actual "
+        "one less `homing_offset`; Dynamixel adds it: change its sign there. Ranges stay, as the middle of a range is "
+        "the zero in degrees; with `drive_mode` 1 a joint counts against its motor."
+    )
+    held = arm_of(chain(arm), arm, rounded)
+    return Stack({"calibration.json": json.dumps(changed, indent=4) + "\n"}, held, load)
+
+
+# Of a motor of 12 bits, and the most that its register holds.
+_COUNTS, _MOST_COUNTS = 4096, 2047
+
+
+def _joints_of(path: str, arm: SerialArm) -> list[Element]:
+    """The joints of a URDF that are those of the arm, by their axes and origins."""
+    root = read_xml(path, URDF_LIMIT, "give the URDF of the robot")
+    above = {link_of(path, joint, "child"): joint for joint in root.findall("joint")}
+    parents = {link_of(path, joint, "parent") for joint in above.values()}
+    wanted, n = _plain(arm), len(arm.joints)
+    for link in [link for link in above if link not in parents]:
+        joints: list[Element] = []
+        while link in above and len(joints) <= len(above):
+            joints.append(above[link])
+            link = link_of(path, above[link], "parent")
+        moving, merged, fixed = [], [], np.eye(4)
+        for joint in joints[::-1]:
+            fixed = fixed @ of_rpy(*_origin(path, joint))
+            if joint.get("type") in ("revolute", "continuous", "prismatic"):
+                moving.append(joint)
+                merged.append(fixed)
+                fixed = np.eye(4)
+        for k in range(len(moving) - n + 1):
+            same = [np.abs(a - b).max() < _EQUAL for a, b in zip(merged[k + 1 : k + n], wanted[1:], strict=True)]
+            axes = np.array([axis_of(path, joint) for joint in moving[k : k + n]])
+            if all(same) and np.abs(axes - (arm.axes * arm.signs[:, None]).numpy()).max() < _EQUAL:
+                return moving[k : k + n]
+    raise InputError(
+        f"{path}: has no {n} joints one after the other with the axes and origins of '{visible(arm.name)}'; give the "
+        "URDF that the records were identified with"
+    )
+
+
+# Differences of numbers that are the same ones, written by other programs [m, rad].
+_EQUAL = 1e-6
+
+
+def _origin(path: str, joint: Element) -> tuple[list[float], list[float]]:
+    """xyz and rpy as they are written."""
+    xyz, angles = (triple(path, joint, "origin", key, "0 0 0").tolist() for key in ("xyz", "rpy"))
+    return xyz, angles
