@@ -153,12 +153,9 @@ def _fit_lot(
         (own if chosen is None else own[chosen])[:, None].expand(judged.shape).flatten()
         for own in (problem.fold, problem.part)
     ]
-    found = []
-    for k, (i, spec) in enumerate(specs):
-        x = columns[k, : len(spec.flat)]
-        beside = x[:0] if nuisance is None else nuisance[i]
-        found.append(_fit_of(spec._replace(theta=theta[k]), residual[k], x, values, float(left[k]), folds, beside))
-    return found
+    ended = [spec._replace(theta=now) for (_, spec), now in zip(specs, theta, strict=True)]
+    beside = residual.new_zeros(len(specs), 0, residual.shape[1]) if nuisance is None else nuisance[axis]
+    return _fits_of(ended, residual, columns, values, left.tolist(), folds, beside)
 
 
 def _padded(places: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
@@ -187,35 +184,60 @@ def _step(x: Tensor, y: Tensor, own: Tensor, real: Tensor, damping: Tensor, valu
     return move.clamp(-_FARTHEST, _FARTHEST)
 
 
-def _fit_of(
-    spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, folds: Sequence[Tensor], nuisance: Tensor
-) -> Fit:
-    """The evidence of the model linearised at `spec.theta`.
+def _fits_of(
+    specs: Sequence[Spec],
+    residual: Tensor,
+    columns: Tensor,
+    values: float,
+    left: Sequence[float],
+    folds: Sequence[Tensor],
+    nuisance: Tensor,
+) -> list[Fit]:
+    """The evidence of models linearised at the `theta` of their sets.
 
     Args:
-        residual, x, nuisance: whitened, `v`, `m x v` and `k x v`.
+        specs: `p` sets.
+        residual, columns, nuisance: whitened, `p x v`, `p x m x v` and `p x k x v`.
         values: how many count.
         left: mean square of the residual itself.
         folds: of each value, `v`: whole runs, and parts of them.
     """
-    shares = (_in_one(spec.theta[list(own)] @ x[g], folds[0]) for own, g in zip(spec.active, spec.groups, strict=True))
+    places, real = _padded([spec.flat for spec in specs])
+    x = columns[:, : places.shape[1]] * real[..., None]
+    own = torch.stack([spec.theta for spec in specs]).gather(-1, places) * real
+    groups = [spec.groups for spec in specs]
+    shares = [
+        max((_in_one(t[g] @ c[g], folds[0]) for g in of_set), default=0.0)
+        for t, c, of_set in zip(own, x, groups, strict=True)
+    ]
     # Runs of one stretch each have no parts.
-    once = max(shares, default=0.0) if int(folds[1].max()) > 0 else 0.0
-    y = residual + spec.theta[list(spec.flat)] @ x
-    grams = products(x, nuisance, y, values)
-    fit = fit_sets(grams, [spec.groups], 0.0)
-    m, evidence = len(x), float(fit.log_evidence[0])
-    return Fit(
-        spec,
-        evidence if math.isfinite(evidence) else -math.inf,
-        float(fit.noise[0]),
-        fit.covariance[0, :m, :m],
-        float(residual.square().sum()),
-        squares_unseen(x, y, fit, spec.groups, folds[once > _ONCE]),
-        once,
-        left,
-        grams,
-    )
+    once = shares if int(folds[1].max()) > 0 else [0.0] * len(specs)
+    y = residual + (own[:, None] @ x)[:, 0]
+    both = torch.cat([x, nuisance], 1)
+    grams = Grams(both @ both.mT, (both @ y[..., None])[..., 0], y.square().sum(-1), values)
+    found = fit_sets(grams, groups, 0.0)
+    unseen = y.new_zeros(len(specs))
+    for within, fold in enumerate(folds):
+        those = torch.tensor([k for k, share in enumerate(once) if (share > _ONCE) == within], dtype=torch.int64)
+        if len(those):
+            some = Fits(*(value[those] for value in found))
+            unseen[those] = squares_unseen(x[those], y[those], some, [groups[k] for k in those.tolist()], fold)
+    counts, beside = [len(spec.flat) for spec in specs], torch.arange(x.shape[1], both.shape[1])
+    kept = [torch.cat([torch.arange(m), beside]) for m in counts]
+    return [
+        Fit(
+            spec,
+            evidence if math.isfinite(evidence) else -math.inf,
+            float(found.noise[k]),
+            found.covariance[k, : counts[k], : counts[k]],
+            float(residual[k].square().sum()),
+            float(unseen[k]),
+            once[k],
+            left[k],
+            Grams(grams.xx[k][at[:, None], at], grams.xy[k, at], grams.yy[k], values),
+        )
+        for k, (spec, evidence, at) in enumerate(zip(specs, found.log_evidence.tolist(), kept, strict=True))
+    ]
 
 
 def products(x: Tensor, nuisance: Tensor, y: Tensor, values: float) -> Grams:
@@ -232,23 +254,27 @@ def _in_one(does: Tensor, fold: Tensor) -> float:
     return float(squares.max() / squares.sum().clamp_min(1e-300)) if len(squares) > 1 else 0.0
 
 
-def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Tensor], fold: Tensor) -> float:
-    """Squares that a linear model leaves of runs that it was not fitted to; its scales are those of all runs.
+def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Sequence[Tensor]], fold: Tensor) -> Tensor:
+    """Squares that linear models leave of runs that they were not fitted to, `p`; their scales are those of all runs.
 
     Args:
-        x, y: whitened columns, `m x v`, and what they explain, `v`.
+        x, y: whitened columns, `p x m x v`, and what they explain, `p x v`.
         fit: to all runs.
-        groups: of columns.
+        groups: of each model's columns.
         fold: of each value, `v`.
     """
-    size = torch.cat([x.new_zeros(0), *(fit.log_scale[0, g].expand(len(c)) for g, c in enumerate(groups))])
-    ridge = torch.diag(torch.exp(-size) * fit.noise[0])
+    ridge = torch.ones_like(x[..., 0])
+    for k, own in enumerate(groups):
+        for g, columns in enumerate(own):
+            ridge[k, columns] = torch.exp(-fit.log_scale[k, g]) * fit.noise[k]
     if int(fold.max()) == 0:
-        return float((y - fit.mean[0, : len(x)] @ x).square().sum())
-    parts = [(x[:, fold == f], y[fold == f]) for f in range(int(fold.max()) + 1)]
-    whole, along = x @ x.mT + ridge, x @ y
-    means = [torch.linalg.solve(whole - a @ a.mT, along - a @ b) for a, b in parts]
-    return sum(float((b - mean @ a).square().sum()) for mean, (a, b) in zip(means, parts, strict=True))
+        return (y - (fit.mean[:, None, : x.shape[1]] @ x)[:, 0]).square().sum(-1)
+    whole, along, found = x @ x.mT + torch.diag_embed(ridge), x @ y[..., None], torch.zeros_like(y[:, 0])
+    for f in range(int(fold.max()) + 1):
+        a, b = x[..., fold == f], y[:, fold == f]
+        mean = torch.linalg.solve(whole - a @ a.mT, along - a @ b[..., None])
+        found += (b - (mean.mT @ a)[:, 0]).square().sum(-1)
+    return found
 
 
 def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:
@@ -307,14 +333,18 @@ def evidences(models: Sequence[tuple[Grams, Sequence[Tensor]]], variance: float)
         variance: of the noise.
     """
     apart = [_under_noise(grams, sum(map(len, groups)), variance) for grams, groups in models]
-    sets, at = list[list[Tensor]](), 0
-    for own, (_, groups) in zip(apart, models, strict=True):
-        sets.append([at + columns for columns in groups])
-        at += len(own.xy)
-    squares, products, sums, values = zip(*apart, strict=True)
-    blocks = torch.block_diag(*squares)  # type: ignore[no-untyped-call]
-    beside = Grams(blocks, torch.cat(products), torch.stack(sums), values[0])
-    found: list[float] = fit_sets(beside, sets, CERTAIN * values[0]).log_evidence.tolist()
+    widest = max(len(own.xy) for own in apart)
+
+    def wide(values: Tensor) -> Tensor:
+        return torch.nn.functional.pad(values, (0, widest - values.shape[-1]) * values.dim())
+
+    grams = Grams(
+        torch.stack([wide(own.xx) for own in apart]),
+        torch.stack([wide(own.xy) for own in apart]),
+        torch.stack([own.yy for own in apart]),
+        apart[0].values,
+    )
+    found: list[float] = fit_sets(grams, [groups for _, groups in models], CERTAIN * grams.values).log_evidence.tolist()
     return found
 
 
