@@ -21,9 +21,15 @@ from ccnn_torch.motion.whiten import Whitening
 # Of a difference quotient, in plausible sizes.
 _STEP = 1e-3
 _STEPS = 6
+# How often numbers at an end of what they may be are looked for in a step.
+_HELD = 3
 # Shares of a Gauss-Newton step that are tried, and what a step is damped by.
 _SHARES = (1.0, 0.25)
 _DAMPING, _LESS, _MORE = 1e-3, 0.2, 10.0
+# Trials for each time that columns are simulated, and share of a promised gain from which columns still hold.
+_TRIALS, _AS_PROMISED = 3, 0.5
+# Share of the steps of a set that leaves so many times the squares of the best one.
+_FAR, _NEAR = 0.5, 1.05
 # A set whose step fails at this damping has ended.
 _STIFF = 10.0
 # Plausible sizes that a number moves at most in a step.
@@ -45,6 +51,7 @@ def fit_many(
     steps: int = _STEPS,
     chosen: Tensor | None = None,
     nuisance: Tensor | None = None,
+    reached: Tensor | None = None,
 ) -> list[Fit]:
     """Fit sets side by side.
 
@@ -55,6 +62,8 @@ def fit_many(
         steps: Gauss-Newton steps.
         chosen: stretches that count; all when None.
         nuisance: whitened, what the nominal values of each axis may be off by, `n x k x v`; nothing when None.
+        reached: squares that the best set of each axis leaves, whitened, `n`: of sets that come nowhere near, columns
+            are simulated half as often. None = no set is known.
     """
     judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
     found: list[Fit] = []
@@ -63,7 +72,7 @@ def fit_many(
         lot.append((axis, spec))
         simulated = sum(len(one.moved) + 2 for _, one in lot) * judged.numel()
         if simulated > _VALUES or k == len(specs) - 1:
-            found += _fit_lot(problem, whitening, lot, steps, chosen, nuisance)
+            found += _fit_lot(problem, whitening, lot, steps, chosen, nuisance, reached)
             lot = []
     return found
 
@@ -86,21 +95,34 @@ def sensitivities(
     Returns:
         `p x v` and `p x m x v`, `v` values; beyond a row's own numbers 0.
     """
+    residual = _white(problem, whitening, theta, axis, chosen)
+    return residual, _columns(problem, whitening, theta, axis, places, residual, chosen)
+
+
+def _white(problem: Problem, whitening: Whitening, theta: Tensor, axis: Tensor, chosen: Tensor | None) -> Tensor:
+    return problem.whitened(problem.residual(theta, axis, chosen), axis, whitening, chosen)
+
+
+def _columns(
+    problem: Problem,
+    whitening: Whitening,
+    theta: Tensor,
+    axis: Tensor,
+    places: Sequence[Sequence[int]],
+    residual: Tensor,
+    chosen: Tensor | None,
+) -> Tensor:
+    """As `sensitivities`; residual: whitened, `p x v`."""
     counts = torch.tensor([len(own) for own in places], dtype=torch.int64)
-    # One row for every number that is moved, after those where none is.
     which = torch.repeat_interleave(torch.arange(len(places)), counts)
-    moved = theta[which]
+    columns = residual.new_zeros(len(theta), int(counts.max()) if len(counts) else 0, residual.shape[1])
     if len(which):
+        # One row for every number that is moved.
+        moved = theta[which]
         moved[torch.arange(len(which)), torch.tensor([j for own in places for j in own])] += _STEP
-    both = torch.cat([axis, axis[which]])
-    residual = problem.residual(torch.cat([theta, moved]), both, chosen)
-    white = problem.whitened(residual, both, whitening, chosen)
-    base, changed = white[: len(theta)], white[len(theta) :]
-    columns = white.new_zeros(len(theta), int(counts.max()) if len(counts) else 0, white.shape[1])
-    if len(which):
         column = torch.cat([torch.arange(int(c)) for c in counts])
-        columns[which, column] = (base[which] - changed) / _STEP
-    return base, columns
+        columns[which, column] = (residual[which] - _white(problem, whitening, moved, axis[which], chosen)) / _STEP
+    return columns
 
 
 def _fit_lot(
@@ -110,42 +132,15 @@ def _fit_lot(
     steps: int,
     chosen: Tensor | None,
     nuisance: Tensor | None,
+    reached: Tensor | None,
 ) -> list[Fit]:
     axis = torch.tensor([i for i, _ in specs])
     theta = torch.stack([s.theta for _, s in specs])
     places = [s.moved for _, s in specs]
-    low, high = problem.library.bounds
-    damping = torch.full((len(specs),), _DAMPING, dtype=theta.dtype)
-    residual, columns = sensitivities(problem, whitening, theta, axis, places, chosen)
     judged = problem.judged if chosen is None else problem.judged[chosen]
     values = float(judged.sum())
-    # Those whose last step gained something, or whose next one may be shorter.
-    run = torch.tensor([k for k, own in enumerate(places) if own], dtype=torch.int64)
-    for _ in range(steps):
-        if not len(run):
-            break
-        active, real = _padded([places[k] for k in run.tolist()])
-        x, y = columns[run, : active.shape[1]], residual[run]
-        cost = _cost(y, theta[run], values)
-        own = theta[run].gather(-1, active)
-        move = _step(x, y, own * real, real, damping[run], values)
-        most, least = (bound[axis[run]].gather(-1, active) for bound in (high, low))
-        taken = [torch.maximum(torch.minimum(own + share * move, most), least) - own for share in _SHARES]
-        trials = torch.stack([theta[run].scatter_add(-1, active, real * step) for step in taken])
-        both = axis[run].repeat(len(_SHARES))
-        left = problem.whitened(problem.residual(trials.flatten(0, 1), both, chosen), both, whitening, chosen)
-        best, which = _cost(left, trials.flatten(0, 1), values).reshape(len(_SHARES), -1).min(0)
-        better = best < cost
-        theta[run[better]] = trials[which[better], better.nonzero()[:, 0]]
-        damping[run] = torch.where(better & (which == 0), damping[run] * _LESS, damping[run] * _MORE).clamp(1e-8, 1e8)
-        moved = run[better]
-        if len(moved):
-            residual[moved], new = sensitivities(
-                problem, whitening, theta[moved], axis[moved], [places[k] for k in moved.tolist()], chosen
-            )
-            columns[moved, : new.shape[1]] = new
-        gained = torch.where(better, cost - best, 0.0) >= _GAINED * values
-        run = run[gained | (~better & (damping[run] < _STIFF))]
+    goal = torch.full_like(theta[:, 0], math.inf) if reached is None else _NEAR * reached[axis]
+    theta, residual, columns = _descended(problem, whitening, theta, axis, places, steps, values, chosen, goal)
     # Here, since the whitened residual does not tell it.
     plain = problem.pooled(problem.residual(theta, axis, chosen))
     left = (plain.square() * judged).sum((-1, -2)) / values
@@ -158,6 +153,79 @@ def _fit_lot(
     return _fits_of(ended, residual, columns, values, left.tolist(), folds, beside)
 
 
+def _descended(
+    problem: Problem,
+    whitening: Whitening,
+    theta: Tensor,
+    axis: Tensor,
+    places: Sequence[Sequence[int]],
+    steps: int,
+    values: float,
+    chosen: Tensor | None,
+    goal: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Numbers where Gauss-Newton steps end, with residuals and columns there, as of `sensitivities`.
+
+    From step to step columns follow what the residuals do (Broyden 1965), and are simulated anew where that promised
+    another gain than there was, or none.
+    """
+    theta = theta.clone()
+    residual, columns = sensitivities(problem, whitening, theta, axis, places, chosen)
+    active, real = _padded(places)
+    low, high = (bound[axis].gather(-1, active) for bound in problem.library.bounds)
+    damping = torch.full((len(theta),), _DAMPING, dtype=theta.dtype)
+    made, is_exact = torch.zeros(len(theta)), torch.ones(len(theta), dtype=torch.bool)
+    run = torch.tensor([k for k, own in enumerate(places) if own and steps], dtype=torch.int64)
+
+    def renew(those: Tensor) -> None:
+        own = [places[k] for k in those.tolist()]
+        new = _columns(problem, whitening, theta[those], axis[those], own, residual[those], chosen)
+        columns[those, : new.shape[1]] = new
+
+    for _ in range(_TRIALS * steps):
+        if not len(run):
+            break
+        x, y, own, at = columns[run], residual[run], theta[run].gather(-1, active[run]), theta[run]
+        ends = ((low[run] - own) * real[run], (high[run] - own) * real[run])
+        move = _step(x, y, own * real[run], ends, damping[run], values)
+        cost = _cost(y, at, values)
+        least = _cost(y - (move[:, None] @ x)[:, 0], at.scatter_add(-1, active[run], move), values)
+        promised, best, share_of = cost - least, cost.clone(), torch.zeros_like(cost)
+        for share in _SHARES:
+            # A shorter step, too, where columns are those of where it begins, or the whole one was none.
+            those = ((promised >= _GAINED * values) & (is_exact[run] | (best >= cost))).nonzero()[:, 0]
+            if not len(those):
+                break
+            here = run[those]
+            tried = at[those].scatter_add(-1, active[here], share * move[those])
+            white = _white(problem, whitening, tried, axis[here], chosen)
+            reached = _cost(white, tried, values)
+            better = reached < best[those]
+            best[those[better]], share_of[those[better]] = reached[better], share
+            theta[here[better]], residual[here[better]] = tried[better], white[better]
+        gained = cost - best
+        good = (gained > 0).nonzero()[:, 0]
+        step = (share_of[:, None] * move)[good]
+        surprise = y[good] - residual[run[good]] - (step[:, None] @ x[good])[:, 0]
+        columns[run[good]] += (step / step.square().sum(-1, keepdim=True))[..., None] * surprise[:, None]
+        is_exact[run[good]] = False
+        damping[run] *= torch.where(share_of == 1, _LESS, 1.0)
+        poor = gained < torch.maximum(_AS_PROMISED * promised, promised.new_tensor(_GAINED * values))
+        stale = poor & ~is_exact[run]
+        damping[run] *= torch.where((share_of < 1) & ~(stale & (share_of == 0)), _MORE, 1.0)
+        anew = run[stale]
+        if len(anew):
+            renew(anew)
+            made[anew], is_exact[anew] = made[anew] + 1, True
+        ended = is_exact[run] & ~stale & ((promised < _GAINED * values) | (damping[run] >= _STIFF))
+        most = torch.where(residual[run].square().sum(-1) <= goal[run], steps, math.ceil(_FAR * steps))
+        run = run[~ended & (made[run] < most)]
+    anew = (~is_exact).nonzero()[:, 0]
+    if len(anew):
+        renew(anew)
+    return theta, residual, columns
+
+
 def _padded(places: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
     """Places of the numbers of each row, `p x m`, padded with 0, and 1 where there is one, else 0."""
     wide = max(map(len, places))
@@ -166,22 +234,30 @@ def _padded(places: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
     return active, real.double()
 
 
-def _step(x: Tensor, y: Tensor, own: Tensor, real: Tensor, damping: Tensor, values: float) -> Tensor:
+def _step(x: Tensor, y: Tensor, own: Tensor, ends: tuple[Tensor, Tensor], damping: Tensor, values: float) -> Tensor:
     """Damped Gauss-Newton steps, `p x m`.
 
     Args:
         x, y: columns `p x m x v` and residuals `p x v`.
         own: the numbers, `p x m`.
-        real: 1 where there is a number, else 0.
+        ends: least and largest step of each number, `p x m`; both 0 where there is no number.
         damping: share of the diagonal, `p`.
         values: how many count.
     """
     noise = (y.square().sum(-1) / values).clamp_min(1e-300)[:, None]
     gram, push = (x @ x.mT) / noise[..., None], (x @ y[..., None])[..., 0] / noise - own / WIDE**2
-    diagonal = gram.diagonal(dim1=-2, dim2=-1)
-    inner = gram + torch.diag_embed(damping[:, None] * diagonal + 1 / WIDE**2 + (1 - real))
-    move: Tensor = torch.linalg.solve(inner, push[..., None])[..., 0] * real
-    return move.clamp(-_FARTHEST, _FARTHEST)
+    inner = gram + torch.diag_embed(damping[:, None] * gram.diagonal(dim1=-2, dim2=-1) + 1 / WIDE**2)
+    low, high = (end.clamp(-_FARTHEST, _FARTHEST) for end in ends)
+    move, held = torch.zeros_like(own), low == high
+    for _ in range(_HELD):
+        # Numbers that a step would take beyond an end stay there, and the others make the best of that.
+        there = torch.where(held, move, 0.0)
+        rest = (push - (inner @ there[..., None])[..., 0]) * ~held
+        left = inner * (~held[:, :, None] & ~held[:, None, :]) + torch.diag_embed(held.to(inner.dtype))
+        free: Tensor = torch.linalg.solve(left, rest[..., None])[..., 0]
+        move = torch.maximum(torch.minimum(there + free, high), low)
+        held = held | (move != there + free)
+    return move
 
 
 def _fits_of(

@@ -29,8 +29,8 @@ _DIGITS = 3
 _GAINED = 1.0
 # Stretches in which sets are looked for.
 _SCREENED = 16
-# Sets that are fitted anew under another noise.
-_KEPT = 6
+# Sets that are fitted anew under another noise; and to all stretches, with log posteriors within so much.
+_KEPT, _LIKELY, _WITHIN = 6, 16, 30.0
 _LONG, _SHORT, _FEW = 8, 5, 3
 # Difference quotients, for numbers that begin at 0 [plausible sizes].
 _STEP = 0.1
@@ -79,21 +79,15 @@ def search(problem: Problem) -> Search:
     # The noise of what is left by what is most probable now.
     theta = torch.stack([f.spec.theta for f in pool.best()])
     left = problem.residual(theta, problem.axes)
-    final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged), theta)
-    final.again(pool)
-    final.neighbours()
-    if final.twins():
-        final.neighbours()
+    near = _Pool(few, fitted_whitening(problem.pooled(left), problem.judged), theta)
+    near.again(pool)
+    likely = near.explored()
+    final = near
+    if few is not problem:
+        final = _Pool(problem, near.whitening, theta)
+        final.fit(likely, _LONG)
     final.reduced()
-    ranked = tuple(tuple(p) for p in final.ranked())
-    # Sets that are probable although forms are wrong are smaller than those above.
-    noise = [own[0].noise for own in ranked]
-    unseen = unseen_errors([fits[:_KEPT] for fits in ranked])
-    for _ in range(2):
-        form = form_errors(problem, final.whitening, final.best(), unseen)
-        final.variance = [a + b for a, b in zip(noise, form, strict=True)]
-    final.forward()
-    final.neighbours()
+    unseen = final.weigh_forms()
     form = form_errors(problem, final.whitening, final.best(), unseen)
     final.variance = None
     final.reduced()
@@ -157,7 +151,9 @@ class _Pool:
     def fit(self, wanted: Sequence[Sequence[Spec]], steps: int) -> None:
         """Fit sets of each axis; one that was fitted before stays if it was better."""
         pairs = [(i, spec) for i, own in enumerate(wanted) for spec in own]
-        fits = fit_many(self.problem, self.whitening, pairs, steps, nuisance=self.nuisance)
+        best = [min((f.rss for f in own.values()), default=math.inf) for own in self.found]
+        reached = torch.tensor(best, dtype=torch.float64)
+        fits = fit_many(self.problem, self.whitening, pairs, steps, nuisance=self.nuisance, reached=reached)
         for (i, _), fit in zip(pairs, fits, strict=True):
             old = self.found[i].get(fit.members)
             if old is None or log_posterior(fit) > log_posterior(old):
@@ -192,6 +188,38 @@ class _Pool:
             gains = [a >= b + _GAINED for a, b in zip(after, before, strict=True)]
             if not any(gains):
                 return
+
+    def explored(self) -> list[list[Spec]]:
+        """The likely sets of each axis, and every effect alone: sets near those that are the most probable."""
+        self.neighbours()
+        if self.twins():
+            self.neighbours()
+        self.reduced()
+        likely = self.likely()
+        # Sets that are probable although forms are wrong are smaller than those above.
+        self.weigh_forms()
+        self.forward()
+        self.neighbours()
+        for own, more, found in zip(likely, self.likely(), self.found, strict=True):
+            own |= more | {members: fit.spec for members, fit in found.items() if len(members) == 1}
+        self.variance = None
+        return [list(own.values()) for own in likely]
+
+    def likely(self) -> list[dict[Members, Spec]]:
+        """The most probable sets of each axis, by their members."""
+        return [
+            {f.members: f.spec for s, f in ranked[:_LIKELY] if s >= ranked[0][0] - _WITHIN}
+            for ranked in map(self.scored, range(self.axes))
+        ]
+
+    def weigh_forms(self) -> list[float]:
+        """From now on sets count under noise and form errors; returns `unseen_errors`."""
+        ranked = self.ranked()
+        unseen = unseen_errors([fits[:_KEPT] for fits in ranked])
+        for _ in range(2):
+            form = form_errors(self.problem, self.whitening, self.best(), unseen)
+            self.variance = [own[0].noise + more for own, more in zip(ranked, form, strict=True)]
+        return unseen
 
     def neighbours(self) -> None:
         """The most probable set without each of its members, and with another effect in the place of each."""
