@@ -359,13 +359,15 @@ def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:
     return 0.5 * values * torch.log(rss.clamp_min(1e-300)) + 0.5 * theta.square().sum(-1) / WIDE**2
 
 
-def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: Sequence[float]) -> list[float]:
+def form_errors(
+    problem: Problem, whitening: Whitening, best: Sequence[Sequence[Fit]], least: Sequence[float]
+) -> list[float]:
     """Variance in every direction by which the forms of each axis' set and of the nominal model may be wrong.
 
     Args:
         problem: the data.
         whitening: of the residual.
-        best: a set of each axis.
+        best: sets of each axis, none of which is clearly the best: the one whose forms are known best counts.
         least: the variance of each axis is at least that.
     """
     theta = torch.zeros(len(best), problem.library.size, dtype=torch.float64)
@@ -377,13 +379,13 @@ def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: 
         problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
         for v in (problem.positions(theta, problem.axes), problem.data.position)
     )
-    found = []
-    for i, fit in enumerate(best):
+
+    def of_set(axis: int, fit: Fit) -> float:
         shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in fit.members]
         energy = fit_sets(fit.grams, [fit.spec.groups], 0.0).energy[0].tolist()[: len(shares)]
-        form = form_variance([*shares, nominal], [*energy, does[i]], max(most[i], does[i]))
-        found.append(max(form, least[i]))
-    return found
+        return form_variance([*shares, nominal], [*energy, does[axis]], max(most[axis], does[axis]))
+
+    return [max(min(of_set(i, fit) for fit in own), least[i]) for i, own in enumerate(best)]
 
 
 def weighed(grams: Grams, sets: Sequence[Sequence[Tensor]], columns: int, variance: float | None) -> Fits:

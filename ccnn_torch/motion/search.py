@@ -88,7 +88,7 @@ def search(problem: Problem) -> Search:
         final.fit(likely, _LONG)
     final.reduced()
     unseen = final.weigh_forms()
-    form = form_errors(problem, final.whitening, final.best(), unseen)
+    form = form_errors(problem, final.whitening, final.tied(), unseen)
     final.variance = None
     final.reduced()
     return Search(
@@ -121,6 +121,10 @@ class _Pool:
 
     def best(self) -> list[Fit]:
         return [self.scored(i)[0][1] for i in range(self.axes)]
+
+    def tied(self) -> list[list[Fit]]:
+        """The most probable sets of each axis, those that are nearly as probable included."""
+        return [[f for s, f in ranked if s >= ranked[0][0] - _GAINED] for ranked in map(self.scored, range(self.axes))]
 
     def ranked(self) -> list[list[Fit]]:
         return [[fit for _, fit in self.scored(i)] for i in range(self.axes)]
@@ -217,7 +221,7 @@ class _Pool:
         ranked = self.ranked()
         unseen = unseen_errors([fits[:_KEPT] for fits in ranked])
         for _ in range(2):
-            form = form_errors(self.problem, self.whitening, self.best(), unseen)
+            form = form_errors(self.problem, self.whitening, self.tied(), unseen)
             self.variance = [own[0].noise + more for own, more in zip(ranked, form, strict=True)]
         return unseen
 
