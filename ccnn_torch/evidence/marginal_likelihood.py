@@ -40,7 +40,10 @@ _FREE = 0.02
 
 
 class Grams(NamedTuple):
-    """Inner products over all rows and channels: `xx` `P x P`, `xy` `P`, `yy`, and the number of values."""
+    """Inner products over all rows and channels: `xx` `P x P`, `xy` `P`, `yy`, and the number of values.
+
+    Of `b` models with columns of their own, `b x P x P`, `b x P` and `b`.
+    """
 
     xx: Tensor
     xy: Tensor
@@ -142,7 +145,7 @@ def fit_sets(
     """Fit every set of groups.
 
     Args:
-        grams: of all columns.
+        grams: of all columns, or of those of each set.
         sets: each a sequence of groups, a group being the indices of its columns, int64.
         noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
         iterations: MacKay updates.
@@ -156,8 +159,10 @@ def fit_sets(
     index, slot = column_indices(width.flatten().cumsum(0).reshape(width.shape) - width, width)
     safe, real = torch.cat([index.new_zeros(1), *(g for s in sets for g in s)])[index + 1], index >= 0
     # Products with columns that are not there are NaN, and no factor 0 makes a number of that.
-    own = torch.where(real[:, :, None] & real[:, None, :], grams.xx[safe[:, :, None], safe[:, None, :]], 0.0)
-    along = torch.where(real, grams.xy[safe], 0.0)
+    each = [torch.arange(len(sets))[:, None]] if grams.xy.dim() > 1 else []
+    square = grams.xx[(*(k[:, None] for k in each), safe[:, :, None], safe[:, None, :])]
+    own = torch.where(real[:, :, None] & real[:, None, :], square, 0.0)
+    along = torch.where(real, grams.xy[(*each, safe)], 0.0)
     none = along[:, :0]
     parts = _Parts(none, none, own[:, :0], own, along, _members(slot, groups, own))
     there = torch.nn.functional.pad(width > 0, (1, 0))

@@ -35,6 +35,9 @@ _LONGEST, _MOST_PARTS = 0.6, 8
 class Drive(NamedTuple):
     """What an axis is given: one entry for each of `b` runs of an axis, padded to `s` samples.
 
+    Of several axes in the same runs, one after the other, what they share may stand there once: entries with fewer rows
+    than the command are repeated.
+
     Attributes:
         time: `b x s` [s], increasing, also in the padding.
         command: `b x s` [rad or m].
@@ -76,52 +79,63 @@ def delayed(time: Tensor, values: Tensor, delay: Tensor) -> Tensor:
     return (x0 + (x1 - x0) * share).reshape(b, p, s).transpose(0, 1)
 
 
-def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor], fast: bool | None = None) -> Tensor:
+def simulate_axes(
+    drive: Drive, parameters: Mapping[str, Tensor], fast: bool | None = None, rows: Tensor | None = None
+) -> Tensor:
     """Positions of axes.
 
     Args:
         drive: of `b` runs.
         parameters: any of `ABSENT` by name, each broadcastable to `p x b`; others are nothing to an axis.
         fast: one axis after the other, compiled by numba, or all at once in numpy; None = what is installed.
+        rows: runs of each axis, `p x r`, to which its parameters are then broadcast; None = all.
 
     Returns:
-        `p x b x s` [rad or m]; the first dimension is 1 where all parameters' are.
+        `p x b x s` (`p x r x s`) [rad or m]; the first dimension is 1 where all parameters' are.
     """
     b, s = drive.command.shape
     # Every entry has the same first dimension then, also where a single value stands for all.
     p = max([1, *(len(v) for v in parameters.values())])
-    a = {n: np.full((p, b), v) for n, v in ABSENT.items()}
+    runs = np.broadcast_to(np.arange(b), (p, b)) if rows is None else rows.numpy()
+    # Where all runs have the same parameters they stand there once.
+    wide = max([1, *(v.shape[-1] for v in parameters.values())])
+    a = {n: np.full((p, wide), v) for n, v in ABSENT.items()}
     for name in a.keys() & parameters.keys():
         a[name][:] = parameters[name].numpy()
     axis, offset = Axis(*(v.ravel() for v in axis_of(a))), a["offset"].ravel()
+    # Which parameters and which run each one has.
+    own = (np.arange(p)[:, None] * wide + np.arange(runs.shape[1]) % wide).ravel()
+    run = np.ascontiguousarray(runs).ravel()
     # The fastest motion of an axis is that of its mass on the gain: each has steps of its own, whatever is beside it.
     masses = axis.whole / np.maximum(axis.gain, TINY)
-    fast_ones = np.sqrt(np.where(masses > 0, masses, math.inf))
-    usual = np.tile(np.median(drive.time.diff(dim=-1).numpy(), -1), p)
+    fast_ones = np.sqrt(np.where(masses > 0, masses, math.inf))[own]
+    usual = np.median(drive.time.diff(dim=-1).numpy(), -1)[run % len(drive.time)]
     parts = np.clip(np.ceil(usual / np.maximum(fast_ones, TINY) / _LONGEST), 1, _MOST_PARTS).astype(np.int64)
     start = np.zeros((b, 3))
     start[:, : drive.start.shape[1]] = drive.start.numpy()
-    bent = np.zeros(b) if drive.bent is None else drive.bent.numpy()
+    bent = np.zeros(1) if drive.bent is None else drive.bent.numpy()
     there = (True, bool(axis.supply.any()), bool(axis.thermal.any()))
-    beside = [
-        np.ascontiguousarray(one.expand(b, -1).numpy()) if has and one is not None else np.zeros((b, 1))
+    push, supply, warm = (
+        np.ascontiguousarray(one.numpy()) if has and one is not None else np.zeros((1, 1))
         for one, has in zip((drive.torque, drive.supply, drive.warm), there, strict=True)
-    ]
-    push, supply, warm = beside
+    )
+    time, command = (np.ascontiguousarray(one.numpy()) for one in (drive.time, drive.command))
     if is_compiled() if fast is None else fast:
-        time, command = (np.ascontiguousarray(one.expand(b, -1).numpy()) for one in (drive.time, drive.command))
-        together = compiled(axis, offset, time, command, start, bent, push, supply, warm, parts)
-        return torch.from_numpy(together).reshape(p, b, s)
-    delay, late = torch.from_numpy(a["delay"]), drive.command.expand(p, -1, -1)
+        together = compiled(axis, offset, own, run, time, command, start, bent, push, supply, warm, parts)
+        return torch.from_numpy(together).reshape(*runs.shape, s)
+    delay, row, at = torch.from_numpy(a["delay"].ravel()[own]), run % len(time), torch.from_numpy(run)
+    late = drive.command[at]
     if bool((delay != 0).any()):
-        late = torch.where(delay[..., None] != 0, delayed(drive.time, drive.command, delay), late)
-    u = (late.reshape(p * b, s) + torch.from_numpy(offset)[:, None]).numpy()
-    step, run = drive.time.diff(dim=-1).numpy(), np.tile(np.arange(b), p)
-    found = np.empty((p * b, s))
+        moved = delayed(drive.time[torch.from_numpy(row)], late, delay[None])[0]
+        late = torch.where(delay[:, None] != 0, moved, late)
+    u, step = late.numpy() + offset[own, None], np.diff(time)
+    found = np.empty((len(run), s))
     for many in np.unique(parts):
         here = np.flatnonzero(parts == many)
-        own = Axis(*(v[here] for v in axis))
-        has = Has(*(bool(v.any()) for v in each_has(own)))
-        one, begin, bend, resists, volts, heat = (v[run[here]].T for v in (step, start, bent, push, supply, warm))
-        found[here] = course(own, has, one, u[here].T.copy(), begin, bend, resists, volts, heat, int(many)).T
-    return torch.from_numpy(found).reshape(p, b, s)
+        some = Axis(*(v[own[here]] for v in axis))
+        has_any = Has(*(bool(v.any()) for v in each_has(some)))
+        one, begin, bend, resists, volts, heat = (
+            v[run[here] % len(v)].T for v in (step, start, bent, push, supply, warm)
+        )
+        found[here] = course(some, has_any, one, u[here].T.copy(), begin, bend, resists, volts, heat, int(many)).T
+    return torch.from_numpy(found).reshape(*runs.shape, s)

@@ -168,6 +168,8 @@ _OF_AXIS, _OF_HAS = len(Axis._fields), len(Has._fields)
 def compiled(
     axis: Axis,
     offset: Array,
+    own: NDArray[np.int64],
+    run: NDArray[np.int64],
     time: Array,
     command: Array,
     start: Array,
@@ -180,16 +182,17 @@ def compiled(
     """Courses of `c` axes, one after the other, `c x s`.
 
     Args:
-        axis: the axes.
-        offset: of their positions, `c`.
-        time, command: `b x s`; axis `j` has row `j % b` of these and of the others.
+        axis, offset: parameters of the axes, and the offsets of their positions.
+        own: which of these each has, `c`.
+        run: and which row of those below, which are repeated where there are fewer, `c`.
+        time, command: `b x s`.
         start: `b x 3`.
         bent: `b`.
-        push, supply, warm: `b x s`, or `b x 1` where there is nothing.
+        push, supply, warm: `b x s`, or `1 x 1` where there is nothing.
         parts: into how many the steps are divided, `c`.
     """
     every, each = (np.stack(v, -1) for v in (axis, each_has(axis)))
-    return _courses(every, each, offset, time, command, start, bent, push, supply, warm, parts)
+    return _courses(every, each, offset, own, run, time, command, start, bent, push, supply, warm, parts)
 
 
 @loop
@@ -197,6 +200,8 @@ def _courses(
     every: Array,
     each: NDArray[np.bool_],
     offset: Array,
+    own: NDArray[np.int64],
+    run: NDArray[np.int64],
     time: Array,
     command: Array,
     start: Array,
@@ -206,12 +211,15 @@ def _courses(
     warm: Array,
     parts: NDArray[np.int64],
 ) -> Array:
-    found = np.empty((len(every), time.shape[1]))
-    for j in range(len(every)):
-        b = j % len(time)
-        axis, has = Axis(*fixed_tuple(every[j], _OF_AXIS)), Has(*fixed_tuple(each[j], _OF_HAS))
-        u = _late(time[b], command[b], axis.delay) if axis.delay != 0 else command[b].copy()
-        u += offset[j]
-        step = time[b, 1:] - time[b, :-1]
-        found[j] = course(axis, has, step, u, start[b], bent[b], push[b], supply[b], warm[b], parts[j])
+    found = np.empty((len(run), time.shape[1]))
+    for j in range(len(run)):
+        i, b = own[j], run[j]
+        axis, has = Axis(*fixed_tuple(every[i], _OF_AXIS)), Has(*fixed_tuple(each[i], _OF_HAS))
+        times = time[b % len(time)]
+        u = _late(times, command[b], axis.delay) if axis.delay != 0 else command[b].copy()
+        u += offset[i]
+        pushed, volts, heat = push[b % len(push)], supply[b % len(supply)], warm[b % len(warm)]
+        found[j] = course(
+            axis, has, times[1:] - times[:-1], u, start[b], bent[b % len(bent)], pushed, volts, heat, parts[j]
+        )
     return found

@@ -21,9 +21,15 @@ from ccnn_torch.motion.whiten import Whitening
 # Of a difference quotient, in plausible sizes.
 _STEP = 1e-3
 _STEPS = 6
+# How often numbers at an end of what they may be are looked for in a step.
+_HELD = 3
 # Shares of a Gauss-Newton step that are tried, and what a step is damped by.
 _SHARES = (1.0, 0.25)
 _DAMPING, _LESS, _MORE = 1e-3, 0.2, 10.0
+# Trials for each time that columns are simulated, and share of a promised gain from which columns still hold.
+_TRIALS, _AS_PROMISED = 3, 0.5
+# Share of the steps of a set that leaves so many times the squares of the best one.
+_FAR, _NEAR = 0.5, 1.05
 # A set whose step fails at this damping has ended.
 _STIFF = 10.0
 # Plausible sizes that a number moves at most in a step.
@@ -45,6 +51,7 @@ def fit_many(
     steps: int = _STEPS,
     chosen: Tensor | None = None,
     nuisance: Tensor | None = None,
+    reached: Tensor | None = None,
 ) -> list[Fit]:
     """Fit sets side by side.
 
@@ -55,6 +62,8 @@ def fit_many(
         steps: Gauss-Newton steps.
         chosen: stretches that count; all when None.
         nuisance: whitened, what the nominal values of each axis may be off by, `n x k x v`; nothing when None.
+        reached: squares that the best set of each axis leaves, whitened, `n`: of sets that come nowhere near, columns
+            are simulated half as often. None = no set is known.
     """
     judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
     found: list[Fit] = []
@@ -63,7 +72,7 @@ def fit_many(
         lot.append((axis, spec))
         simulated = sum(len(one.moved) + 2 for _, one in lot) * judged.numel()
         if simulated > _VALUES or k == len(specs) - 1:
-            found += _fit_lot(problem, whitening, lot, steps, chosen, nuisance)
+            found += _fit_lot(problem, whitening, lot, steps, chosen, nuisance, reached)
             lot = []
     return found
 
@@ -86,21 +95,34 @@ def sensitivities(
     Returns:
         `p x v` and `p x m x v`, `v` values; beyond a row's own numbers 0.
     """
+    residual = _white(problem, whitening, theta, axis, chosen)
+    return residual, _columns(problem, whitening, theta, axis, places, residual, chosen)
+
+
+def _white(problem: Problem, whitening: Whitening, theta: Tensor, axis: Tensor, chosen: Tensor | None) -> Tensor:
+    return problem.whitened(problem.residual(theta, axis, chosen), axis, whitening, chosen)
+
+
+def _columns(
+    problem: Problem,
+    whitening: Whitening,
+    theta: Tensor,
+    axis: Tensor,
+    places: Sequence[Sequence[int]],
+    residual: Tensor,
+    chosen: Tensor | None,
+) -> Tensor:
+    """As `sensitivities`; residual: whitened, `p x v`."""
     counts = torch.tensor([len(own) for own in places], dtype=torch.int64)
-    # One row for every number that is moved, after those where none is.
     which = torch.repeat_interleave(torch.arange(len(places)), counts)
-    moved = theta[which]
+    columns = residual.new_zeros(len(theta), int(counts.max()) if len(counts) else 0, residual.shape[1])
     if len(which):
+        # One row for every number that is moved.
+        moved = theta[which]
         moved[torch.arange(len(which)), torch.tensor([j for own in places for j in own])] += _STEP
-    both = torch.cat([axis, axis[which]])
-    residual = problem.residual(torch.cat([theta, moved]), both, chosen)
-    white = problem.whitened(residual, both, whitening, chosen)
-    base, changed = white[: len(theta)], white[len(theta) :]
-    columns = white.new_zeros(len(theta), int(counts.max()) if len(counts) else 0, white.shape[1])
-    if len(which):
         column = torch.cat([torch.arange(int(c)) for c in counts])
-        columns[which, column] = (base[which] - changed) / _STEP
-    return base, columns
+        columns[which, column] = (residual[which] - _white(problem, whitening, moved, axis[which], chosen)) / _STEP
+    return columns
 
 
 def _fit_lot(
@@ -110,42 +132,15 @@ def _fit_lot(
     steps: int,
     chosen: Tensor | None,
     nuisance: Tensor | None,
+    reached: Tensor | None,
 ) -> list[Fit]:
     axis = torch.tensor([i for i, _ in specs])
     theta = torch.stack([s.theta for _, s in specs])
     places = [s.moved for _, s in specs]
-    low, high = problem.library.bounds
-    damping = torch.full((len(specs),), _DAMPING, dtype=theta.dtype)
-    residual, columns = sensitivities(problem, whitening, theta, axis, places, chosen)
     judged = problem.judged if chosen is None else problem.judged[chosen]
     values = float(judged.sum())
-    # Those whose last step gained something, or whose next one may be shorter.
-    run = torch.tensor([k for k, own in enumerate(places) if own], dtype=torch.int64)
-    for _ in range(steps):
-        if not len(run):
-            break
-        active, real = _padded([places[k] for k in run.tolist()])
-        x, y = columns[run, : active.shape[1]], residual[run]
-        cost = _cost(y, theta[run], values)
-        own = theta[run].gather(-1, active)
-        move = _step(x, y, own * real, real, damping[run], values)
-        most, least = (bound[axis[run]].gather(-1, active) for bound in (high, low))
-        taken = [torch.maximum(torch.minimum(own + share * move, most), least) - own for share in _SHARES]
-        trials = torch.stack([theta[run].scatter_add(-1, active, real * step) for step in taken])
-        both = axis[run].repeat(len(_SHARES))
-        left = problem.whitened(problem.residual(trials.flatten(0, 1), both, chosen), both, whitening, chosen)
-        best, which = _cost(left, trials.flatten(0, 1), values).reshape(len(_SHARES), -1).min(0)
-        better = best < cost
-        theta[run[better]] = trials[which[better], better.nonzero()[:, 0]]
-        damping[run] = torch.where(better & (which == 0), damping[run] * _LESS, damping[run] * _MORE).clamp(1e-8, 1e8)
-        moved = run[better]
-        if len(moved):
-            residual[moved], new = sensitivities(
-                problem, whitening, theta[moved], axis[moved], [places[k] for k in moved.tolist()], chosen
-            )
-            columns[moved, : new.shape[1]] = new
-        gained = torch.where(better, cost - best, 0.0) >= _GAINED * values
-        run = run[gained | (~better & (damping[run] < _STIFF))]
+    goal = torch.full_like(theta[:, 0], math.inf) if reached is None else _NEAR * reached[axis]
+    theta, residual, columns = _descended(problem, whitening, theta, axis, places, steps, values, chosen, goal)
     # Here, since the whitened residual does not tell it.
     plain = problem.pooled(problem.residual(theta, axis, chosen))
     left = (plain.square() * judged).sum((-1, -2)) / values
@@ -153,12 +148,82 @@ def _fit_lot(
         (own if chosen is None else own[chosen])[:, None].expand(judged.shape).flatten()
         for own in (problem.fold, problem.part)
     ]
-    found = []
-    for k, (i, spec) in enumerate(specs):
-        x = columns[k, : len(spec.flat)]
-        beside = x[:0] if nuisance is None else nuisance[i]
-        found.append(_fit_of(spec._replace(theta=theta[k]), residual[k], x, values, float(left[k]), folds, beside))
-    return found
+    ended = [spec._replace(theta=now) for (_, spec), now in zip(specs, theta, strict=True)]
+    beside = residual.new_zeros(len(specs), 0, residual.shape[1]) if nuisance is None else nuisance[axis]
+    return _fits_of(ended, residual, columns, values, left.tolist(), folds, beside)
+
+
+def _descended(
+    problem: Problem,
+    whitening: Whitening,
+    theta: Tensor,
+    axis: Tensor,
+    places: Sequence[Sequence[int]],
+    steps: int,
+    values: float,
+    chosen: Tensor | None,
+    goal: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Numbers where Gauss-Newton steps end, with residuals and columns there, as of `sensitivities`.
+
+    From step to step columns follow what the residuals do (Broyden 1965), and are simulated anew where that promised
+    another gain than there was, or none.
+    """
+    theta = theta.clone()
+    residual, columns = sensitivities(problem, whitening, theta, axis, places, chosen)
+    active, real = _padded(places)
+    low, high = (bound[axis].gather(-1, active) for bound in problem.library.bounds)
+    damping = torch.full((len(theta),), _DAMPING, dtype=theta.dtype)
+    made, is_exact = torch.zeros(len(theta)), torch.ones(len(theta), dtype=torch.bool)
+    run = torch.tensor([k for k, own in enumerate(places) if own and steps], dtype=torch.int64)
+
+    def renew(those: Tensor) -> None:
+        own = [places[k] for k in those.tolist()]
+        new = _columns(problem, whitening, theta[those], axis[those], own, residual[those], chosen)
+        columns[those, : new.shape[1]] = new
+
+    for _ in range(_TRIALS * steps):
+        if not len(run):
+            break
+        x, y, own, at = columns[run], residual[run], theta[run].gather(-1, active[run]), theta[run]
+        ends = ((low[run] - own) * real[run], (high[run] - own) * real[run])
+        move = _step(x, y, own * real[run], ends, damping[run], values)
+        cost = _cost(y, at, values)
+        least = _cost(y - (move[:, None] @ x)[:, 0], at.scatter_add(-1, active[run], move), values)
+        promised, best, share_of = cost - least, cost.clone(), torch.zeros_like(cost)
+        for share in _SHARES:
+            # A shorter step, too, where columns are those of where it begins, or the whole one was none.
+            those = ((promised >= _GAINED * values) & (is_exact[run] | (best >= cost))).nonzero()[:, 0]
+            if not len(those):
+                break
+            here = run[those]
+            tried = at[those].scatter_add(-1, active[here], share * move[those])
+            white = _white(problem, whitening, tried, axis[here], chosen)
+            reached = _cost(white, tried, values)
+            better = reached < best[those]
+            best[those[better]], share_of[those[better]] = reached[better], share
+            theta[here[better]], residual[here[better]] = tried[better], white[better]
+        gained = cost - best
+        good = (gained > 0).nonzero()[:, 0]
+        step = (share_of[:, None] * move)[good]
+        surprise = y[good] - residual[run[good]] - (step[:, None] @ x[good])[:, 0]
+        columns[run[good]] += (step / step.square().sum(-1, keepdim=True))[..., None] * surprise[:, None]
+        is_exact[run[good]] = False
+        damping[run] *= torch.where(share_of == 1, _LESS, 1.0)
+        poor = gained < torch.maximum(_AS_PROMISED * promised, promised.new_tensor(_GAINED * values))
+        stale = poor & ~is_exact[run]
+        damping[run] *= torch.where((share_of < 1) & ~(stale & (share_of == 0)), _MORE, 1.0)
+        anew = run[stale]
+        if len(anew):
+            renew(anew)
+            made[anew], is_exact[anew] = made[anew] + 1, True
+        ended = is_exact[run] & ~stale & ((promised < _GAINED * values) | (damping[run] >= _STIFF))
+        most = torch.where(residual[run].square().sum(-1) <= goal[run], steps, math.ceil(_FAR * steps))
+        run = run[~ended & (made[run] < most)]
+    anew = (~is_exact).nonzero()[:, 0]
+    if len(anew):
+        renew(anew)
+    return theta, residual, columns
 
 
 def _padded(places: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
@@ -169,53 +234,86 @@ def _padded(places: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
     return active, real.double()
 
 
-def _step(x: Tensor, y: Tensor, own: Tensor, real: Tensor, damping: Tensor, values: float) -> Tensor:
+def _step(x: Tensor, y: Tensor, own: Tensor, ends: tuple[Tensor, Tensor], damping: Tensor, values: float) -> Tensor:
     """Damped Gauss-Newton steps, `p x m`.
 
     Args:
         x, y: columns `p x m x v` and residuals `p x v`.
         own: the numbers, `p x m`.
-        real: 1 where there is a number, else 0.
+        ends: least and largest step of each number, `p x m`; both 0 where there is no number.
         damping: share of the diagonal, `p`.
         values: how many count.
     """
     noise = (y.square().sum(-1) / values).clamp_min(1e-300)[:, None]
     gram, push = (x @ x.mT) / noise[..., None], (x @ y[..., None])[..., 0] / noise - own / WIDE**2
-    diagonal = gram.diagonal(dim1=-2, dim2=-1)
-    inner = gram + torch.diag_embed(damping[:, None] * diagonal + 1 / WIDE**2 + (1 - real))
-    move: Tensor = torch.linalg.solve(inner, push[..., None])[..., 0] * real
-    return move.clamp(-_FARTHEST, _FARTHEST)
+    inner = gram + torch.diag_embed(damping[:, None] * gram.diagonal(dim1=-2, dim2=-1) + 1 / WIDE**2)
+    low, high = (end.clamp(-_FARTHEST, _FARTHEST) for end in ends)
+    move, held = torch.zeros_like(own), low == high
+    for _ in range(_HELD):
+        # Numbers that a step would take beyond an end stay there, and the others make the best of that.
+        there = torch.where(held, move, 0.0)
+        rest = (push - (inner @ there[..., None])[..., 0]) * ~held
+        left = inner * (~held[:, :, None] & ~held[:, None, :]) + torch.diag_embed(held.to(inner.dtype))
+        free: Tensor = torch.linalg.solve(left, rest[..., None])[..., 0]
+        move = torch.maximum(torch.minimum(there + free, high), low)
+        held = held | (move != there + free)
+    return move
 
 
-def _fit_of(
-    spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, folds: Sequence[Tensor], nuisance: Tensor
-) -> Fit:
-    """The evidence of the model linearised at `spec.theta`.
+def _fits_of(
+    specs: Sequence[Spec],
+    residual: Tensor,
+    columns: Tensor,
+    values: float,
+    left: Sequence[float],
+    folds: Sequence[Tensor],
+    nuisance: Tensor,
+) -> list[Fit]:
+    """The evidence of models linearised at the `theta` of their sets.
 
     Args:
-        residual, x, nuisance: whitened, `v`, `m x v` and `k x v`.
+        specs: `p` sets.
+        residual, columns, nuisance: whitened, `p x v`, `p x m x v` and `p x k x v`.
         values: how many count.
         left: mean square of the residual itself.
         folds: of each value, `v`: whole runs, and parts of them.
     """
-    shares = (_in_one(spec.theta[list(own)] @ x[g], folds[0]) for own, g in zip(spec.active, spec.groups, strict=True))
+    places, real = _padded([spec.flat for spec in specs])
+    x = columns[:, : places.shape[1]] * real[..., None]
+    own = torch.stack([spec.theta for spec in specs]).gather(-1, places) * real
+    groups = [spec.groups for spec in specs]
+    shares = [
+        max((_in_one(t[g] @ c[g], folds[0]) for g in of_set), default=0.0)
+        for t, c, of_set in zip(own, x, groups, strict=True)
+    ]
     # Runs of one stretch each have no parts.
-    once = max(shares, default=0.0) if int(folds[1].max()) > 0 else 0.0
-    y = residual + spec.theta[list(spec.flat)] @ x
-    grams = products(x, nuisance, y, values)
-    fit = fit_sets(grams, [spec.groups], 0.0)
-    m, evidence = len(x), float(fit.log_evidence[0])
-    return Fit(
-        spec,
-        evidence if math.isfinite(evidence) else -math.inf,
-        float(fit.noise[0]),
-        fit.covariance[0, :m, :m],
-        float(residual.square().sum()),
-        squares_unseen(x, y, fit, spec.groups, folds[once > _ONCE]),
-        once,
-        left,
-        grams,
-    )
+    once = shares if int(folds[1].max()) > 0 else [0.0] * len(specs)
+    y = residual + (own[:, None] @ x)[:, 0]
+    both = torch.cat([x, nuisance], 1)
+    grams = Grams(both @ both.mT, (both @ y[..., None])[..., 0], y.square().sum(-1), values)
+    found = fit_sets(grams, groups, 0.0)
+    unseen = y.new_zeros(len(specs))
+    for within, fold in enumerate(folds):
+        those = torch.tensor([k for k, share in enumerate(once) if (share > _ONCE) == within], dtype=torch.int64)
+        if len(those):
+            some = Fits(*(value[those] for value in found))
+            unseen[those] = squares_unseen(x[those], y[those], some, [groups[k] for k in those.tolist()], fold)
+    counts, beside = [len(spec.flat) for spec in specs], torch.arange(x.shape[1], both.shape[1])
+    kept = [torch.cat([torch.arange(m), beside]) for m in counts]
+    return [
+        Fit(
+            spec,
+            evidence if math.isfinite(evidence) else -math.inf,
+            float(found.noise[k]),
+            found.covariance[k, : counts[k], : counts[k]],
+            float(residual[k].square().sum()),
+            float(unseen[k]),
+            once[k],
+            left[k],
+            Grams(grams.xx[k][at[:, None], at], grams.xy[k, at], grams.yy[k], values),
+        )
+        for k, (spec, evidence, at) in enumerate(zip(specs, found.log_evidence.tolist(), kept, strict=True))
+    ]
 
 
 def products(x: Tensor, nuisance: Tensor, y: Tensor, values: float) -> Grams:
@@ -232,23 +330,27 @@ def _in_one(does: Tensor, fold: Tensor) -> float:
     return float(squares.max() / squares.sum().clamp_min(1e-300)) if len(squares) > 1 else 0.0
 
 
-def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Tensor], fold: Tensor) -> float:
-    """Squares that a linear model leaves of runs that it was not fitted to; its scales are those of all runs.
+def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Sequence[Tensor]], fold: Tensor) -> Tensor:
+    """Squares that linear models leave of runs that they were not fitted to, `p`; their scales are those of all runs.
 
     Args:
-        x, y: whitened columns, `m x v`, and what they explain, `v`.
+        x, y: whitened columns, `p x m x v`, and what they explain, `p x v`.
         fit: to all runs.
-        groups: of columns.
+        groups: of each model's columns.
         fold: of each value, `v`.
     """
-    size = torch.cat([x.new_zeros(0), *(fit.log_scale[0, g].expand(len(c)) for g, c in enumerate(groups))])
-    ridge = torch.diag(torch.exp(-size) * fit.noise[0])
+    ridge = torch.ones_like(x[..., 0])
+    for k, own in enumerate(groups):
+        for g, columns in enumerate(own):
+            ridge[k, columns] = torch.exp(-fit.log_scale[k, g]) * fit.noise[k]
     if int(fold.max()) == 0:
-        return float((y - fit.mean[0, : len(x)] @ x).square().sum())
-    parts = [(x[:, fold == f], y[fold == f]) for f in range(int(fold.max()) + 1)]
-    whole, along = x @ x.mT + ridge, x @ y
-    means = [torch.linalg.solve(whole - a @ a.mT, along - a @ b) for a, b in parts]
-    return sum(float((b - mean @ a).square().sum()) for mean, (a, b) in zip(means, parts, strict=True))
+        return (y - (fit.mean[:, None, : x.shape[1]] @ x)[:, 0]).square().sum(-1)
+    whole, along, found = x @ x.mT + torch.diag_embed(ridge), x @ y[..., None], torch.zeros_like(y[:, 0])
+    for f in range(int(fold.max()) + 1):
+        a, b = x[..., fold == f], y[:, fold == f]
+        mean = torch.linalg.solve(whole - a @ a.mT, along - a @ b[..., None])
+        found += (b - (mean.mT @ a)[:, 0]).square().sum(-1)
+    return found
 
 
 def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:
@@ -257,13 +359,15 @@ def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:
     return 0.5 * values * torch.log(rss.clamp_min(1e-300)) + 0.5 * theta.square().sum(-1) / WIDE**2
 
 
-def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: Sequence[float]) -> list[float]:
+def form_errors(
+    problem: Problem, whitening: Whitening, best: Sequence[Sequence[Fit]], least: Sequence[float]
+) -> list[float]:
     """Variance in every direction by which the forms of each axis' set and of the nominal model may be wrong.
 
     Args:
         problem: the data.
         whitening: of the residual.
-        best: a set of each axis.
+        best: sets of each axis, none of which is clearly the best: the one whose forms are known best counts.
         least: the variance of each axis is at least that.
     """
     theta = torch.zeros(len(best), problem.library.size, dtype=torch.float64)
@@ -275,13 +379,13 @@ def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: 
         problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
         for v in (problem.positions(theta, problem.axes), problem.data.position)
     )
-    found = []
-    for i, fit in enumerate(best):
+
+    def of_set(axis: int, fit: Fit) -> float:
         shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in fit.members]
         energy = fit_sets(fit.grams, [fit.spec.groups], 0.0).energy[0].tolist()[: len(shares)]
-        form = form_variance([*shares, nominal], [*energy, does[i]], max(most[i], does[i]))
-        found.append(max(form, least[i]))
-    return found
+        return form_variance([*shares, nominal], [*energy, does[axis]], max(most[axis], does[axis]))
+
+    return [max(min(of_set(i, fit) for fit in own), least[i]) for i, own in enumerate(best)]
 
 
 def weighed(grams: Grams, sets: Sequence[Sequence[Tensor]], columns: int, variance: float | None) -> Fits:
@@ -307,14 +411,18 @@ def evidences(models: Sequence[tuple[Grams, Sequence[Tensor]]], variance: float)
         variance: of the noise.
     """
     apart = [_under_noise(grams, sum(map(len, groups)), variance) for grams, groups in models]
-    sets, at = list[list[Tensor]](), 0
-    for own, (_, groups) in zip(apart, models, strict=True):
-        sets.append([at + columns for columns in groups])
-        at += len(own.xy)
-    squares, products, sums, values = zip(*apart, strict=True)
-    blocks = torch.block_diag(*squares)  # type: ignore[no-untyped-call]
-    beside = Grams(blocks, torch.cat(products), torch.stack(sums), values[0])
-    found: list[float] = fit_sets(beside, sets, CERTAIN * values[0]).log_evidence.tolist()
+    widest = max(len(own.xy) for own in apart)
+
+    def wide(values: Tensor) -> Tensor:
+        return torch.nn.functional.pad(values, (0, widest - values.shape[-1]) * values.dim())
+
+    grams = Grams(
+        torch.stack([wide(own.xx) for own in apart]),
+        torch.stack([wide(own.xy) for own in apart]),
+        torch.stack([own.yy for own in apart]),
+        apart[0].values,
+    )
+    found: list[float] = fit_sets(grams, [groups for _, groups in models], CERTAIN * grams.values).log_evidence.tolist()
     return found
 
 

@@ -229,7 +229,7 @@ def holds(problem: Problem, candidate: Candidate) -> bool:
     own, columns, y = candidate.rows
     fold = problem.fold[:, None].expand(problem.judged.shape).flatten()
     less, more = (
-        squares_unseen(x, y, fit_sets(candidate.grams, [groups], 0.0), groups, fold)
+        float(squares_unseen(x[None], y[None], fit_sets(candidate.grams, [groups], 0.0), [groups], fold))
         for x, groups in ((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))
     )
     return more < less

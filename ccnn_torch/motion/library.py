@@ -131,17 +131,16 @@ class Library(NamedTuple):
             Of every parameter that is not absent everywhere, `p`.
         """
         found = {name: value[axis] for name, value in self.nominal.items()}
-        for j in range(len(self.numbers[0])):
-            if not bool((theta[:, j] != 0).any()):
-                continue
+        used = (theta != 0).any(0).tolist()
+        for j in (j for j in range(len(self.numbers[0])) if used[j]):
             for a, (name, _, how) in enumerate(self.numbers[0][j].acts):
                 size = theta.new_tensor([own[j].scale * own[j].acts[a][1] for own in self.numbers])
                 amount = theta[:, j] * size[axis]
                 before = found.get(name, torch.full_like(amount, ABSENT.get(name, 0.0)))
                 found[name] = before + amount if how == "add" else before * amount.clamp(-5, 5).exp()
         for name, place in self.held.items():
-            value = theta[:, place]
-            if bool((value != 0).any()):
+            if used[place]:
+                value = theta[:, place]
                 found[name] = torch.where(value != 0, value, found.get(name, torch.full_like(value, ABSENT[name])))
         for name in _POSITIVE:
             if name in found:

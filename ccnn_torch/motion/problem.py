@@ -99,7 +99,7 @@ class Problem:
             `p x b x s` [rad or m].
         """
         rows = torch.arange(len(self.data.time)) if chosen is None else chosen
-        moved = self._moved(theta, axis, rows, self._start)
+        moved = self._moved(theta, axis, rows)
         return moved if self.simulated is None else moved + self._beyond[axis][:, rows]
 
     @cached_property
@@ -156,7 +156,7 @@ class Problem:
         About `theta`, `n x k`, the machine as it seems to be: a model that is wrong may be near to its stability.
         """
         rows, nominal = torch.arange(len(self.data.time)), self.library.nominal
-        plain, columns = self._moved(theta, self.axes, rows, self._start), []
+        plain, columns = self._moved(theta, self.axes, rows), []
         absent = torch.zeros(len(self.followed), dtype=torch.float64)
         for key, share in self.unsure.items():
             # The direction of a weight is known as well as its size.
@@ -165,7 +165,7 @@ class Problem:
                 before = nominal.get(name, absent + ABSENT[name])
                 moved = before + share * (before if size is None else size)
                 other = self.library._replace(nominal={**nominal, name: moved})
-                columns.append(replace(self, library=other)._moved(theta, self.axes, rows, self._start) - plain)
+                columns.append(replace(self, library=other)._moved(theta, self.axes, rows) - plain)
         return torch.stack([*columns, self.stamped])
 
     @property
@@ -183,32 +183,30 @@ class Problem:
         step = self.data.time.diff(dim=-1)[there] / rows.diff(dim=-1)[there]
         return share_of(self.known, TIME) * float(step.median()) * self.data.speed
 
-    def _moved(self, theta: Tensor, axis: Tensor, rows: Tensor, start: Tensor) -> Tensor:
-        data, p, b = self.data, len(theta), len(rows)
+    @cached_property
+    def _drive(self) -> Drive:
+        """All axes in all stretches, one axis after the other."""
+        data, start = self.data, self._start
+        torque = None if self.torque is None else self.torque.flatten(0, 1)
+        return Drive(
+            data.time, self.followed.flatten(0, 1), start.flatten(0, 1), self.supply, self.warm, torque, data.bent
+        )
 
-        def of_axis(values: Tensor) -> Tensor:
-            return values[axis[:, None], rows].flatten(0, 1)
-
-        def of_all(values: Tensor) -> Tensor:
-            return values[rows].expand(p, -1, -1).flatten(0, 1)
-
+    def _moved(self, theta: Tensor, axis: Tensor, rows: Tensor, start: Tensor | None = None) -> Tensor:
+        """As `positions`, without what a simulator adds; start: as of `Drive`, of every axis and stretch."""
+        drive, which = self._drive, axis[:, None] * len(self.data.time) + rows
+        if start is not None:
+            drive = drive._replace(start=start.flatten(0, 1))
         parameters = self.library.parameters(theta, axis)
         own, mass = {name: parameters.pop(f"{OWN}{name}", None) for name in self.own}, parameters.pop(CARRIED, None)
-        torque = None if self.torque is None else of_axis(self.torque)
         if mass is not None and self.carried is not None:
-            load = mass.repeat_interleave(b)[:, None] * of_axis(self.carried)
-            torque = load if torque is None else torque + load
-        drive = Drive(
-            of_all(data.time),
-            of_axis(self.followed),
-            of_axis(start),
-            of_all(self.supply),
-            of_all(self.warm),
-            torque,
-            None if self.data.bent is None else self.data.bent[rows].repeat(p),
-        )
-        values = {name: value.repeat_interleave(b)[None] for name, value in parameters.items()}
-        moved = simulate_axes(drive, values)[0].reshape(p, b, -1)
+            load = mass[:, None, None] * self.carried[axis[:, None], rows]
+            torque = load if self.torque is None else load + self.torque[axis[:, None], rows]
+            # Each model has runs of its own then.
+            drive = Drive(*(None if v is None else v[which.flatten() % len(v)] for v in drive))
+            drive = drive._replace(torque=torque.flatten(0, 1))
+            which = torch.arange(which.numel()).reshape(which.shape)
+        moved = simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
         for name, value in own.items():
             if value is not None:
                 moved = moved + value[:, None, None] * self.own[name][axis[:, None], rows]
@@ -216,16 +214,22 @@ class Problem:
 
     def residual(self, theta: Tensor, axis: Tensor, chosen: Tensor | None = None) -> Tensor:
         """Measured less simulated, as `positions`; finite."""
-        measured = self.data.position if chosen is None else self.data.position[:, chosen]
-        far = _FARTHEST * (measured.amax((-1, -2)) - measured.amin((-1, -2)))[axis, None, None] + 1e-12
-        left = measured[axis] - self.positions(theta, axis, chosen)
-        return torch.maximum(torch.minimum(torch.nan_to_num(left, nan=torch.inf), far), -far)
+        measured = self.data.position[axis] if chosen is None else self.data.position[axis[:, None], chosen]
+        far, left = self._far[axis, None, None], measured - self.positions(theta, axis, chosen)
+        # What is no number is far away.
+        return torch.fmax(torch.fmin(left, far), -far)
+
+    @cached_property
+    def _far(self) -> Tensor:
+        measured = self.data.position
+        return _FARTHEST * (measured.amax((-1, -2)) - measured.amin((-1, -2))) + 1e-12
 
     def pooled(self, residual: Tensor) -> Tensor:
         """Means over `pool` samples each, `... x s` -> `... x t`."""
         m = self.pool
         kept = residual[..., : residual.shape[-1] // m * m]
-        return kept.reshape(*kept.shape[:-1], kept.shape[-1] // m, m).mean(-1)
+        found: Tensor = sum((kept[..., k::m] for k in range(1, m)), kept[..., ::m]) / m
+        return found
 
     @cached_property
     def fold(self) -> Tensor:
@@ -246,7 +250,7 @@ class Problem:
             found[run == one] = torch.arange(count) * min(FOLDS, count) // count
         return found
 
-    @property
+    @cached_property
     def judged(self) -> Tensor:
         """Which of the means count, `b x t`."""
         return self.pooled(self.data.judged.double()) == 1

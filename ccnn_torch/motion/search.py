@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.priors import EFFECT, crowd
-from ccnn_torch.motion.fit import fit_many, form_errors, products, sensitivities, unseen_errors, weighed
+from ccnn_torch.motion.fit import evidences, fit_many, form_errors, products, sensitivities, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.servo import TORQUES
@@ -29,8 +29,8 @@ _DIGITS = 3
 _GAINED = 1.0
 # Stretches in which sets are looked for.
 _SCREENED = 16
-# Sets that are fitted anew under another noise.
-_KEPT = 6
+# Sets that are fitted anew under another noise; and to all stretches, with log posteriors within so much.
+_KEPT, _LIKELY, _WITHIN = 6, 16, 30.0
 _LONG, _SHORT, _FEW = 8, 5, 3
 # Difference quotients, for numbers that begin at 0 [plausible sizes].
 _STEP = 0.1
@@ -79,22 +79,16 @@ def search(problem: Problem) -> Search:
     # The noise of what is left by what is most probable now.
     theta = torch.stack([f.spec.theta for f in pool.best()])
     left = problem.residual(theta, problem.axes)
-    final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged), theta)
-    final.again(pool)
-    final.neighbours()
-    if final.twins():
-        final.neighbours()
+    near = _Pool(few, fitted_whitening(problem.pooled(left), problem.judged), theta)
+    near.again(pool)
+    likely = near.explored()
+    final = near
+    if few is not problem:
+        final = _Pool(problem, near.whitening, theta)
+        final.fit(likely, _LONG)
     final.reduced()
-    ranked = tuple(tuple(p) for p in final.ranked())
-    # Sets that are probable although forms are wrong are smaller than those above.
-    noise = [own[0].noise for own in ranked]
-    unseen = unseen_errors([fits[:_KEPT] for fits in ranked])
-    for _ in range(2):
-        form = form_errors(problem, final.whitening, final.best(), unseen)
-        final.variance = [a + b for a, b in zip(noise, form, strict=True)]
-    final.forward()
-    final.neighbours()
-    form = form_errors(problem, final.whitening, final.best(), unseen)
+    unseen = final.weigh_forms()
+    form = form_errors(problem, final.whitening, final.tied(), unseen)
     final.variance = None
     final.reduced()
     return Search(
@@ -121,45 +115,49 @@ class _Pool:
         zero = torch.zeros(self.library.size, dtype=torch.float64)
         # Of noise and form errors of each axis; None: the noise that each set leaves.
         self.variance: list[float] | None = None
-        self.scores: dict[tuple[int, tuple[int, ...], float], tuple[Fit, float]] = {}
+        self.scores: list[dict[tuple[float, Members], tuple[float, Fit]]] = [{} for _ in range(self.axes)]
         self.found: list[dict[tuple[int, ...], Fit]] = [{} for _ in range(self.axes)]
         self.fit([[Spec((), zero, (), 0.0)] for _ in range(self.axes)], 0)
 
     def best(self) -> list[Fit]:
-        return [self.ranked()[i][0] for i in range(self.axes)]
+        return [self.scored(i)[0][1] for i in range(self.axes)]
+
+    def tied(self) -> list[list[Fit]]:
+        """The most probable sets of each axis, those that are nearly as probable included."""
+        return [[f for s, f in ranked if s >= ranked[0][0] - _GAINED] for ranked in map(self.scored, range(self.axes))]
 
     def ranked(self) -> list[list[Fit]]:
-        return [
-            sorted(own.values(), key=lambda f: (-_level(self.score(i, f)), f.members))
-            for i, own in enumerate(self.found)
-        ]
+        return [[fit for _, fit in self.scored(i)] for i in range(self.axes)]
 
     def leading(self, axis: int) -> list[Fit]:
         """The most probable sets of an axis; of those that do the same one."""
         apart: dict[float, Fit] = {}
-        for fit in self.ranked()[axis]:
-            apart.setdefault(_level(self.score(axis, fit)), fit)
+        for score, fit in self.scored(axis):
+            apart.setdefault(_level(score), fit)
         return list(apart.values())[:_BEAM]
 
     def noise_of(self, axis: int) -> float | None:
         return None if self.variance is None else self.variance[axis]
 
-    def score(self, axis: int, fit: Fit) -> float:
-        """Log posterior under the noise that counts."""
-        if self.variance is None:
-            return log_posterior(fit)
-        key = (axis, fit.members, self.variance[axis])
-        old = self.scores.get(key)
-        if old is None or old[0] is not fit:
-            weighed_fit = weighed(fit.grams, [fit.spec.groups], len(fit.spec.flat), self.variance[axis])
-            evidence = float(weighed_fit.log_evidence[0])
-            old = self.scores[key] = fit, evidence + log_posterior(fit) - fit.log_evidence
-        return old[1]
+    def scored(self, axis: int) -> list[tuple[float, Fit]]:
+        """Log posterior of every set of an axis under the noise that counts, the most probable first."""
+        fits, variance, old = list(self.found[axis].values()), self.noise_of(axis), self.scores[axis]
+        new = [
+            fit for fit in fits if variance is not None and old.get((variance, fit.members), (0.0, None))[1] is not fit
+        ]
+        if variance is not None and new:
+            weighed_new = evidences([(fit.grams, fit.spec.groups) for fit in new], variance)
+            for fit, evidence in zip(new, weighed_new, strict=True):
+                old[variance, fit.members] = evidence + log_posterior(fit) - fit.log_evidence, fit
+        found = [(log_posterior(fit), fit) if variance is None else old[variance, fit.members] for fit in fits]
+        return sorted(found, key=lambda one: (-_level(one[0]), one[1].members))
 
     def fit(self, wanted: Sequence[Sequence[Spec]], steps: int) -> None:
         """Fit sets of each axis; one that was fitted before stays if it was better."""
         pairs = [(i, spec) for i, own in enumerate(wanted) for spec in own]
-        fits = fit_many(self.problem, self.whitening, pairs, steps, nuisance=self.nuisance)
+        best = [min((f.rss for f in own.values()), default=math.inf) for own in self.found]
+        reached = torch.tensor(best, dtype=torch.float64)
+        fits = fit_many(self.problem, self.whitening, pairs, steps, nuisance=self.nuisance, reached=reached)
         for (i, _), fit in zip(pairs, fits, strict=True):
             old = self.found[i].get(fit.members)
             if old is None or log_posterior(fit) > log_posterior(old):
@@ -176,7 +174,7 @@ class _Pool:
         done: list[set[tuple[int, ...]]] = [set() for _ in range(self.axes)]
         gains = [True] * self.axes
         for _ in range(_MOST):
-            before = [self.score(i, f) for i, f in enumerate(self.best())]
+            before = [self.scored(i)[0][0] for i in range(self.axes)]
             bases = [
                 [f for f in self.leading(i) if gains[i] and f.members not in done[i] and len(f.members) < _MOST]
                 for i in range(self.axes)
@@ -190,10 +188,42 @@ class _Pool:
                 [[f.spec for f in self.leading(i) if f.members and own] for i, own in enumerate(bases)],
                 _SHORT,
             )
-            after = [self.score(i, f) for i, f in enumerate(self.best())]
+            after = [self.scored(i)[0][0] for i in range(self.axes)]
             gains = [a >= b + _GAINED for a, b in zip(after, before, strict=True)]
             if not any(gains):
                 return
+
+    def explored(self) -> list[list[Spec]]:
+        """The likely sets of each axis, and every effect alone: sets near those that are the most probable."""
+        self.neighbours()
+        if self.twins():
+            self.neighbours()
+        self.reduced()
+        likely = self.likely()
+        # Sets that are probable although forms are wrong are smaller than those above.
+        self.weigh_forms()
+        self.forward()
+        self.neighbours()
+        for own, more, found in zip(likely, self.likely(), self.found, strict=True):
+            own |= more | {members: fit.spec for members, fit in found.items() if len(members) == 1}
+        self.variance = None
+        return [list(own.values()) for own in likely]
+
+    def likely(self) -> list[dict[Members, Spec]]:
+        """The most probable sets of each axis, by their members."""
+        return [
+            {f.members: f.spec for s, f in ranked[:_LIKELY] if s >= ranked[0][0] - _WITHIN}
+            for ranked in map(self.scored, range(self.axes))
+        ]
+
+    def weigh_forms(self) -> list[float]:
+        """From now on sets count under noise and form errors; returns `unseen_errors`."""
+        ranked = self.ranked()
+        unseen = unseen_errors([fits[:_KEPT] for fits in ranked])
+        for _ in range(2):
+            form = form_errors(self.problem, self.whitening, self.tied(), unseen)
+            self.variance = [own[0].noise + more for own, more in zip(ranked, form, strict=True)]
+        return unseen
 
     def neighbours(self) -> None:
         """The most probable set without each of its members, and with another effect in the place of each."""
