@@ -134,7 +134,7 @@ def joined(parts: Sequence[Problem], shared: int) -> Problem:
 
 @dataclass(frozen=True)
 class Fit:
-    """What a solver found.
+    """The result of a solver: values, residuals, whether it converged.
 
     Attributes:
         values: `r x k` [SI].
@@ -157,7 +157,7 @@ def part_of(progress: Progress | None, number: int, count: int) -> Progress | No
 
 
 class Solver(Protocol):
-    """A way to minimise a problem; all its randomness comes from the seed."""
+    """Protocol of a solver: it minimises a problem; all its randomness comes from the seed."""
 
     def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
         """Minimise half the weighted sum of squared residuals and prior terms of every machine."""

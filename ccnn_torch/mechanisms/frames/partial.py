@@ -231,7 +231,9 @@ def as_measured(
     mechanism: Mechanism, pose: Sequence[Coordinate], where: str = "records", measured: Tensor | None = None
 ) -> Mechanism:
     """The mechanism as records with these pose coordinates show it: itself, an arm by positions alone or by directions,
-    or `Partial`. A machine whose file says that its pose is a position stays what it is.
+    or `Partial`.
+
+    A machine whose file says that its pose is a position stays what it is.
 
     Args:
         where: the file, which opens the sentence.
