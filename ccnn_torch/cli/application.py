@@ -12,7 +12,7 @@ import typer
 
 from ccnn_torch.cli.from_records import check, diagnose, identify, new, run
 from ccnn_torch.cli.studies import blind_check, compare, keys, plan, simulate, suite, sweep
-from ccnn_torch.cli.with_model import compensate, export, picture, sign, verify
+from ccnn_torch.cli.with_model import compensate, export, picture, report, sign, verify
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError, MethodFailedError, out_of_memory
 from ccnn_torch.run_folder.folder import Stopped
@@ -59,6 +59,7 @@ for _command in (
     diagnose,
     check,
     blind_check,
+    report,
     picture,
     sign,
     keys,

@@ -15,7 +15,8 @@ from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of, wi
 from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
 from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
 from ccnn_torch.diagnosis.from_records import naming
-from ccnn_torch.diagnosis.page.data import RESULT, about_of, load_labels
+from ccnn_torch.diagnosis.page.data import RESULT, About, about_of, load_labels
+from ccnn_torch.diagnosis.page.first_screen import first_screen
 from ccnn_torch.diagnosis.page.outputs import write_diagnosis, write_result
 from ccnn_torch.diagnosis.page.report import print_diagnosis
 from ccnn_torch.diagnosis.progress import TO_REPORT, TO_VERDICT, watched
@@ -29,7 +30,7 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism, simulated_rows
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.screen import say_place, stdout, step_bar
-from ccnn_torch.report.table import print_text
+from ccnn_torch.report.table import print_labelled
 from ccnn_torch.run_folder.folder import if_stopped, locked
 
 _Found = TypeVar("_Found", bound=Said)
@@ -77,11 +78,12 @@ def run_job(job: Job[_Found], config: DiagnoseConfig, quiet: bool, details: bool
             kept = write_result(folder, said)
             with if_stopped(f"interrupted after the verdict, which is kept in {kept}; the rest is not complete"):
                 if not quiet:
-                    print_text(said.verdict["text"], stdout, "bold")
+                    first = first_screen(said.to_json(), About())[0]
+                    print_labelled(first.label, first.text, stdout)
                 beside = job.complete(config, folder, said, quiet)
                 if not quiet:
                     results = read_json(kept)
-                    print_diagnosis(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
+                    print_diagnosis(results, stdout, about_of(load_labels(folder)), begun=True, details=details)
                     say_place(f"Written: {typed_path(str(kept))}, and beside it {', '.join(beside)}")
     except InputError:
         print_diagnosis(said.to_json(), stdout)

@@ -249,7 +249,7 @@ def write_outputs(found: Identification, folder: Path) -> None:
     write_json(folder / RESULTS, IdentifiedResults.model_validate(results))
 
 
-def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, tables: bool) -> None:
+def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, details: bool | None) -> None:
     path = folder.path
     with progress_bar(quiet) as bar:
 
@@ -258,9 +258,9 @@ def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, ta
             return lambda done: bar.update(task, completed=done)
 
         found = identify(config, path / "methods", watch)
-    if tables and not quiet:
+    if details is not None and not quiet:
         # Before anything is written: what was found is not lost where the disk is full.
-        identified_page(found.results).show(stdout)
+        identified_page(found.results, folder=path).show(stdout, details)
     note("writing tables, plots and files …", quiet)
     with resume_hint(f"ccnn identify --resume {path}"):
         write_outputs(found, path)

@@ -46,8 +46,8 @@ def test_a_gantry_has_squareness_and_leads(seed: int, tmp_path: Path, cli: Cli) 
     numbers = _gantry(tmp_path, seed)
     out = tmp_path / "found"
     words = (f"records={tmp_path / 'gantry.csv'}", f"mechanism={tmp_path / 'gantry.yaml'}", "save_report=false")
-    code, screen, _ = cli("identify", *words, "--out", out)
-    assert code == 0 and "squareness xy [µm/m]" in screen and "18 of 18 parameters are identified" in screen
+    code, screen, _ = cli("identify", *words, "--details", "--out", out)
+    assert code == 0 and "squareness xy [µm/m]" in screen and "all 18 values are determined" in screen
     assert "squareness xy [µm/m]" in (out / "identified.md").read_text()
     rows = list(csv.DictReader((out / "identified.csv").read_text().splitlines()))
     told = {(r["name"], r["quantity"]): float(r["value"]) for r in rows if r["subject"] == "number"}
@@ -104,7 +104,7 @@ def test_straightness_is_found_beyond_a_known_table_and_commanded_away(tmp_path:
     table = "pitch_errors: {q1: {at: [0 mm, 300 mm, 1000 mm], error: [2 um, 14 um, -7 um]}}"
     machine.write_text(f"{template('gantry')}{table}\n")
     code, screen, told = cli(
-        "identify", f"records={records}", f"mechanism={machine}", "save_report=false", "--out", out
+        "identify", f"records={records}", f"mechanism={machine}", "save_report=false", "--details", "--out", out
     )
     assert code == 0, told
     assert "straightness EYX [µm]" in screen
@@ -206,7 +206,7 @@ def test_rails_stay_straight_by_the_tolerance_of_the_machine_file(tmp_path: Path
     words = (f"records={tmp_path / 'bed.csv'}", f"mechanism={_printer(tmp_path)}", "noise=10 um", "save_report=false")
     leans = {}
     for out, more in (("own", ()), ("wide", ("constraint={kind: pose, tolerance: {rad: 0.01}}",))):
-        code, screen, _ = cli("identify", *words, *more, "--out", tmp_path / out)
+        code, screen, _ = cli("identify", *words, *more, "--details", "--out", tmp_path / out)
         assert code == 0 and "printer.cfg (Klipper)" in screen and "endstop A [mm]" in screen
         # One radius, as in the firmware: three of them and three angles would move and turn the whole printer.
         assert screen.count("delta radius [mm]") == 1 and "tower angle C" not in screen
