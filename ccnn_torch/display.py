@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
@@ -120,3 +121,9 @@ def is_shown(character: str) -> bool:
 def short_path(path: str) -> str:
     """A file's folder and name: enough to know it by, and nothing of the machine on which a page was made."""
     return "/".join(PurePath(path).parts[-2:])
+
+
+def typed_path(path: str) -> str:
+    """A path as it may be typed here: relative where it is below the current folder."""
+    near = os.path.relpath(path)
+    return path if near.startswith("..") else near

@@ -88,7 +88,7 @@ def test_a_folder_of_something_else_is_left_as_it_is(cli: Cli, rows: Path, tmp_p
 
 
 def test_check_says_what_rows_can_show_without_a_verdict(cli: Cli, rows: Path) -> None:
-    code, shown, _ = cli("check", "--records", rows, "--mechanism", "five_bar")
+    code, shown, _ = cli("check", "--records", rows, "--mechanism", "five_bar", "--details")
     assert code == 0
     assert "80 rows" in shown and "tool cannot be seen without" in shown
     # One line an effect, with the closest few of those that could take it over.

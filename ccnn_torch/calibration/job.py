@@ -24,6 +24,7 @@ from ccnn_torch.calibration.prepare import Prepared, TooManyRepeatsError, prepar
 from ccnn_torch.calibration.result import by_score, plan_of
 from ccnn_torch.calibration.statistics import reach_block, share_unit, spread
 from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.display import typed_path
 from ccnn_torch.engine import Failure, Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError, WriteError
 from ccnn_torch.mechanisms import Instrument
@@ -90,7 +91,7 @@ def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, details: bool
         write_blocks(config, folder, list(blocks.values()), lambda path: RUN.resume(path, quiet=True, details=None))
     if details is not None and not quiet:
         run_page(RunResults.read(folder.results)).show(stdout, details)
-        say_place(f"Everything is in {folder.path}")
+        say_place(f"Everything is in {typed_path(str(folder.path))}")
 
 
 def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet: bool, details: bool | None) -> None:
@@ -129,7 +130,8 @@ def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet:
             raise
     if details is not None and not quiet:
         run_page(calibration.results).show(stdout, details)
-        say_place(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")
+        place = typed_path(str(folder.path))
+        say_place(f"Everything is in {place}; open {place}/report.html")
 
 
 RUN = FolderJob("ccnn run", RunConfig, "results.json", "checkpoints/*.safetensors", _prepared, _run)

@@ -265,6 +265,7 @@ def check(
     effects: Effects = None,
     config: ConfigOption = None,
     seed: Seed = None,
+    details: Details = False,
     quiet: Quiet = False,
 ) -> None:
     """Report which effects records can identify: rows, noise, covariates, unidentifiable effects, confusable pairs.
@@ -291,7 +292,7 @@ def check(
     if not quiet:
         for line in check_text(found):
             say(line)
-        if found.confusable:
+        if details and found.confusable:
             print_table(check_table(found), stdout)
     if wanted.out is not None:
         write_check(Path(wanted.out), found)

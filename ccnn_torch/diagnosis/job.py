@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,7 +20,7 @@ from ccnn_torch.diagnosis.page.outputs import write_diagnosis, write_result
 from ccnn_torch.diagnosis.page.report import print_diagnosis
 from ccnn_torch.diagnosis.progress import TO_REPORT, TO_VERDICT, watched
 from ccnn_torch.diagnosis.result import Said
-from ccnn_torch.display import short_path
+from ccnn_torch.display import short_path, typed_path
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.time import Homing
 from ccnn_torch.errors import InputError
@@ -187,19 +186,10 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
         model = shlex.quote(f"{keys['out']}/model.onnx")
         sentence = "No model holds these effects by themselves: these lines learn the gap and correct targets."
         return sentence, run, f"ccnn compensate {model} TARGETS.csv COMMANDS.csv"
-    sentence = (
-        "The first line corrects targets by the machine with these effects alone, the second one fits all effects that "
-        "pay, and learns what they leave where that pays."
-    )
+    sentence = "the first line corrects targets by these effects alone, the second one trains a model of all that pays."
     return sentence, f"ccnn compensate {shlex.quote(typed_path(str(path)))} TARGETS.csv COMMANDS.csv", run
 
 
 def _records(config: DiagnoseConfig) -> str:
     files = config.records if isinstance(config.records, list) else [str(config.records)]
     return ",".join(typed_path(file) for file in files)
-
-
-def typed_path(path: str) -> str:
-    """A path as it may be typed here: relative where it is below the current folder."""
-    near = os.path.relpath(path)
-    return path if near.startswith("..") else near

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.config.split import Given
+from ccnn_torch.display import typed_path
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Fit, Progress
@@ -260,12 +261,13 @@ def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, de
         found = identify(config, path / "methods", watch)
     if details is not None and not quiet:
         # Before anything is written: what was found is not lost where the disk is full.
-        identified_page(found.results, folder=path).show(stdout, details)
+        identified_page(found.results, folder=typed_path(str(path))).show(stdout, details)
     note("writing tables, plots and files …", quiet)
     with resume_hint(f"ccnn identify --resume {path}"):
         write_outputs(found, path)
     if not quiet:
-        say_place(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
+        place = typed_path(str(path))
+        say_place(f"Everything is in {place}" + (f"; open {place}/report.html" if config.save_report else ""))
     if found.results["methods"][found.results["method"]]["converged"] == 0:
         why = " ".join([not_settled(found.results), *found.results["doubts"]])
         raise MethodFailedError(

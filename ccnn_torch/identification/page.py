@@ -146,7 +146,7 @@ def identified_tables(results: Block) -> list[Table]:
     return [table for table in tables if table is not None]
 
 
-def _answers(results: Block, folder: Path | None) -> list[Answer]:
+def _answers(results: Block, folder: str | None) -> list[Answer]:
     """What is known, what to enter in a printer's firmware, and what to do next."""
     said = [Answer("What is known", _known(results))]
     if (printer := printer_table(results)) is not None:
@@ -156,12 +156,12 @@ def _answers(results: Block, folder: Path | None) -> list[Answer]:
         lines = tuple(f"{section} {', '.join(keys)}" for section, keys in sections.items())
         said.append(Answer("Enter in printer.cfg", printer.note, lines))
     if folder is not None and not results["simulated"] and results["methods"][results["method"]]["converged"]:
-        line = f"ccnn compensate {shlex.quote(str(folder / 'identified.yaml'))} TARGETS.csv COMMANDS.csv --pose"
+        line = f"ccnn compensate {shlex.quote(f'{folder}/identified.yaml')} TARGETS.csv COMMANDS.csv --pose"
         said.append(Answer("Next", "correct targets by the identified machine.", (line,)))
     return said
 
 
-def identified_page(results: Block, figures: Sequence[InlineFigure] = (), folder: Path | None = None) -> Page:
+def identified_page(results: Block, figures: Sequence[InlineFigure] = (), folder: str | None = None) -> Page:
     """All that an identification shows; with its folder, on a screen, also the next command."""
     rows, machines = results["rows"], results["machines"]
     legs = "".join(f", {count} for leg {leg}" for leg, count in sorted(rows["per_leg"].items()))

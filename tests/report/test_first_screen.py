@@ -108,9 +108,15 @@ def test_lines_and_cards_have_the_clearest_numbers_to_enter() -> None:
     results = _with("geometry", parameters)
     enter = next(a for a in first_screen(results, About(folder="runs/d")) if a.label == "Enter instead")
     assert enter.commands[0] == "link 5 a5: 105.000 mm (off by 5.000 mm ± 20 µm)" and len(enter.commands) == 3
-    assert enter.text == "3 of 5 numbers, ± at 95 %; only all together repair the model: runs/d/report.html."
+    assert enter.text == "all of these together, ± at 95 %; 2 more are in runs/d/report.html."
     (card,) = cards(results)
     assert card.title == "Geometry error" and card.numbers[:3] == enter.commands and card.look
+    many = {f"a{i}": (1e-3 * i, 1e-5, "m", f"link {i}", 0.1) for i in range(1, 9)}
+    results["effects"] = _with("geometry", many)["effects"]
+    for block in results["effects"][0]["parameters"].values():
+        block["together"] = 8
+    enter = next(a for a in first_screen(results, About()) if a.label == "Enter instead")
+    assert enter.text == "3 of 8 numbers, ± at 95 %; only all together repair the model: report.html."
     assert [card.title for card in cards(outside()[0])][-1] == "What is left" and cards(none()[0]) == []
 
 

@@ -80,14 +80,16 @@ def cards(results: Block) -> list[Card]:
 
 def _enter(results: Block, table: Table, about: About) -> Answer:
     """The clearest numbers, a line each; the table has more of them."""
-    known = [_number_rows(results, effect, ON_PAGE) for effect in results["verdict"]["effects"]]
+    known = [_number_rows(results, effect, _ON_LINES) for effect in results["verdict"]["effects"]]
     rows, count = [row for own, *_ in known for row in own], sum(len(own) + more for own, _, more in known)
     enters = [row for row in rows if row[3] != "–"]
-    shown = (enters or rows)[:_ON_LINES]
-    text = "± at 95 %, if nothing else acts."
-    if count > len(shown):
-        kept = f"{about.folder}/" if about.folder else ""
+    shown, kept = enters or rows, f"{about.folder}/" if about.folder else ""
+    if len(shown) > ON_SCREEN:
+        shown = shown[:_ON_LINES]
         text = f"{len(shown)} of {count} numbers, ± at 95 %; only all together repair the model: {kept}report.html."
+    else:
+        more = f"{count - len(shown)} more are in {kept}report.html" if count > len(shown) else "if nothing else acts"
+        text = f"all of these together, ± at 95 %; {more}." if len(shown) > 1 else f"± at 95 %; {more}."
     return Answer("Enter instead" if enters else "Numbers found", text, tuple(_line(row) for row in shown), table)
 
 

@@ -163,9 +163,10 @@ def print_diagnosis(
     page = diagnosis_page(results, about, screen=True)
     if details:
         print_text(verdict_text(results), console)
-    elif begun:
+    else:
         first, *rest = page.sections
-        page = replace(page, sections=[replace(first, answers=first.answers[1:]), *rest])
+        answers = [a for a in first.answers[begun:] if a.label != "Fitted frames"]
+        page = replace(page, sections=[replace(first, answers=answers), *rest])
     page.show(console, details)
 
 
@@ -246,7 +247,7 @@ def check_text(check: Check) -> list[str]:
     units = {name: {"unit": "rad" if name.startswith("r") else "m"} for name in check.noise}
     noise = ", ".join(f"{name} {size_text(size, units[name], 2)}" for name, size in check.noise.items())
     lines = [
-        f"{check.rows} rows, {len(check.aside)} of them set aside; Jacobian's condition number up to "
+        f"{check.rows} rows, {len(check.aside)} of them set aside; condition number of the Jacobian up to "
         f"{check.condition:.3g}.",
         f"Noise, {'as given' if check.noise_given else 'estimated'}: {noise}.",
         f"Covariates: {', '.join(check.covariates) or 'none'}.",
@@ -254,8 +255,16 @@ def check_text(check: Check) -> list[str]:
     lines += [aside_text(check.aside, check.why_aside, check.lines_aside)] if check.aside else []
     lines += [f"{remark}." for remark in check.remarks]
     lines += [f"Caution: {caution}." for caution in check.cautions]
-    lines += [f"{name} cannot be seen without {why}." for name, why in check.missing.items()]
-    lines += [f"{name} could hide: its plausible size is {size:.2g} of the noise." for name, size in check.weak.items()]
+    reasons: dict[str, list[str]] = {}
+    for name, why in check.missing.items():
+        reasons.setdefault(why, []).append(name)
+    lines += [f"{unseen_text(listed(names), why)}." for why, names in reasons.items()]
+    if check.weak:
+        sizes = [f"{name} ({size:.2g} of it)" for name, size in check.weak.items()]
+        lines.append(f"{listed(sizes)} could hide in the noise: that large each plausibly is.")
+    if check.confusable:
+        alike = len({first for first, _, _ in check.confusable})
+        lines.append(f"{alike} effects do nearly what others can do on these rows; --details lists them.")
     return lines
 
 
@@ -269,7 +278,9 @@ def check_table(check: Check) -> Table:
         for name, others in found.items()
     )
     note = (
-        "Cosine between what an effect is likely to do and what another can do. A diagnosis still distinguishes them "
-        "where the other one needs implausible or more coefficients; all pairs are in check.json (--out)."
+        "1.000: on these rows the other does all that the effect does (cosine of the two). A diagnosis still tells "
+        "them apart where the other needs implausible or more numbers; all pairs are in check.json (--out)."
     )
-    return Table("Confusable", ("effect", "taken over by"), rows, note, ("taken over by",))
+    return Table(
+        "Effects that look alike on these rows", ("effect", "can be taken for"), rows, note, ("can be taken for",)
+    )
