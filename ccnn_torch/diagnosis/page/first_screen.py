@@ -118,9 +118,10 @@ def _wrong(results: Block) -> str:
 
 def _sure(results: Block) -> str:
     verdict = results["verdict"]
-    text = (
-        f"Probability {probability_words(verdict['probability'])}{f' {LEAST}' * (len(results.get('joints', ())) > 1)}"
-    )
+    least = f" {LEAST}" * (len(results.get("joints", ())) > 1)
+    what = "that nothing acts" if verdict["none"] else "that these causes, and no others, act"
+    what = what if verdict["effects"] or verdict["none"] else "that no effect of the library is the cause"
+    text = f"Probability {probability_words(verdict['probability'])}{least} {what}"
     if in_doubt(results):
         text += "; the noise is not known, and what is taken for it may hold another cause"
     return f"{text}."

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
+from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
 
 Progress = Callable[[float], None]
@@ -70,10 +71,10 @@ def check_equations(problem: Problem) -> None:
     channels, k = len(problem.channels), len(problem.parameters)
     held = int(torch.isfinite(problem.prior_sd).sum())
     if equations + held < k:
-        needed = -(-(k - held) // channels)
+        needed, priors = -(-(k - held) // channels), f" and {held} priors" if held else ""
         raise InputError(
-            f"{rows} rows of {channels} equations{f' and {held} priors' if held else ''} cannot determine {k} free "
-            f"parameters; measure at least {needed} poses, or fix parameters"
+            f"{rows} rows of {count_text(channels, 'equation')}{priors} cannot determine {k} free parameters; measure at "
+            f"least {needed} rows, or fix parameters"
         )
 
 
