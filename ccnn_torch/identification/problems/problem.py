@@ -73,8 +73,8 @@ def check_equations(problem: Problem) -> None:
     if equations + held < k:
         needed, priors = -(-(k - held) // channels), f" and {held} priors" if held else ""
         raise InputError(
-            f"{rows} rows of {count_text(channels, 'equation')}{priors} cannot determine {k} free parameters; measure at "
-            f"least {needed} rows, or fix parameters"
+            f"{rows} rows of {count_text(channels, 'equation')}{priors} cannot determine {k} free parameters; "
+            f"measure at least {needed} rows, or fix parameters"
         )
 
 
