@@ -73,6 +73,8 @@ class Screen(SphinxDirective):
     optional_arguments = 1
 
     def run(self) -> list[nodes.Node]:
+        # What is printed changes with the package, whether or not the page does.
+        self.env.note_reread()
         text = "\n".join(self.content) + "\n"
         return [nodes.literal_block(screens[text], screens[text], language="console", classes=["screen"])]
 

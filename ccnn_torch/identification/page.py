@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ccnn_torch.display import count_text, display_unit, number_text, own_unit
+from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter
 from ccnn_torch.files.write import write_rows
 from ccnn_torch.identification.judge import figure_text
 from ccnn_torch.identification.klipper import printer_table
@@ -17,6 +17,9 @@ from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.page import Answer, InlineFigure, Page, Section, sections_of
 from ccnn_torch.report.table import Table, table_of
 
+_Z95 = 1.96
+# Values on a screen.
+_LINES = 6
 BEFORE_SAYS = "Before: links nominal, what is unknown of frames, tool and instrument fitted."
 _HOLDERS = {
     "sockets": "the other rows of its socket put",
@@ -148,8 +151,10 @@ def identified_tables(results: Block) -> list[Table]:
 
 def _answers(results: Block, folder: str | None) -> list[Answer]:
     """What is known, what to enter in a printer's firmware, and what to do next."""
-    said = [Answer("What is known", _known(results))]
-    if (printer := printer_table(results)) is not None:
+    printer = printer_table(results)
+    lines = () if printer or results["simulated"] else tuple(_clearest(results))
+    said = [Answer("What is known", _known(results), lines)]
+    if printer is not None:
         sections: dict[str, list[str]] = {}
         for section, key, _, write in printer.rows:
             sections.setdefault(section or [*sections][-1], []).append(f"{key} {write}")
@@ -159,6 +164,19 @@ def _answers(results: Block, folder: str | None) -> list[Answer]:
         line = f"ccnn compensate {shlex.quote(f'{folder}/identified.yaml')} TARGETS.csv COMMANDS.csv --pose"
         said.append(Answer("Next", "correct targets by the identified machine.", (line,)))
     return said
+
+
+def _clearest(results: Block) -> Iterator[str]:
+    """The values that are determined best against how far they moved, a line each."""
+    known = {name: block for name, block in _free(results).items() if block["identifiable"] and block["sd"]}
+    # Frames are where instrument and target stood, nothing to enter.
+    own = [name for name in known if not name.startswith(("base_", "tool_"))]
+    own.sort(key=lambda name: -abs(known[name]["value"] - known[name]["nominal"]) / known[name]["sd"])
+    for name in own[:_LINES]:
+        block = known[name]
+        half = _Z95 * block["sd"]
+        scale, unit = own_unit(block) or display_unit(block["unit"], half)
+        yield f"{name}: {to_enter(block, block['value'])} ± {number_text(half / scale, 2)} {unit}"
 
 
 def identified_page(results: Block, figures: Sequence[InlineFigure] = (), folder: str | None = None) -> Page:

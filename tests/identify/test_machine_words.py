@@ -259,3 +259,17 @@ def _true_place(carriages: Array, parameters: dict[str, dict[str, float]]) -> Ar
         slope = 2 * np.concatenate([across, up[..., None]], -1)
         place = place - np.linalg.solve(slope, left[..., None])[..., 0]
     return place
+
+
+def test_the_screen_has_the_terms_of_the_telescope_that_is_shipped(tmp_path: Path, cli: Cli) -> None:
+    """Its true terms are those of experiments/data/README.md."""
+    data = Path(__file__).parents[2] / "experiments" / "data"
+    words = (f"records={data / 'telescope.csv'}", f"mechanism={data / 'telescope.yaml'}", "save_report=false")
+    code, screen, said = cli("identify", *words, "--out", tmp_path / "found")
+    assert code == 0 and "all 6 values are determined" in screen, said
+    lines = dict(line.strip().rsplit(": ", 1) for line in screen.splitlines() if " ± " in line)
+    truth = {"IA": 412.0, "IE": -85.0, "CA": 34.0, "NPAE": -27.0, "AN": 61.0, "AW": -48.0}
+    assert {name.split(" ")[-1] for name in lines} == set(truth) and "┃" not in screen
+    for name, line in lines.items():
+        value, half = (float(part.split(" ")[0]) for part in line.split(" ± "))
+        assert abs(value - truth[name.split(" ")[-1]]) < 2 * half

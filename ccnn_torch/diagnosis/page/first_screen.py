@@ -28,7 +28,7 @@ from ccnn_torch.diagnosis.verdict.text import (
     undetermined,
     words_for,
 )
-from ccnn_torch.display import display_unit, number_text, own_unit, unit_text
+from ccnn_torch.display import number_text, to_enter, unit_text
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.report.page import Answer, Card
@@ -332,7 +332,7 @@ def _number_rows(results: Block, effect: str, most: int) -> tuple[list[tuple[str
         block = parameters[name]
         value, error = block["value"], _Z95 * block["sd"]
         part = block.get("part") or ""
-        enter = "–" if block.get("nominal") is None or not repairs else _whole(block, block["nominal"] + value)
+        enter = "–" if block.get("nominal") is None or not repairs else to_enter(block, block["nominal"] + value)
         text = f"{block.get('word') or _named(name, part)}{_often(name, parameters)}{_counted(block)}"
         rows.append((text, told_words(block, value, 4), f"± {told_words(block, error, 2, value)}", enter))
     notes += [_OWN_UNIT] if any(not block["unit"] for block in clear.values()) else []
@@ -390,21 +390,3 @@ def _counted(block: Block) -> str:
     about = block["about"]
     scale, unit = (1e-3, "mm") if about["unit"] == "m" else (1.0, unit_text(about["unit"]))
     return f", about {about['joint']} = {number_text(about['value'] / scale, _MIDDLE_DIGITS)} {unit}"
-
-
-def _whole(block: Block, value: float) -> str:
-    """A number to enter, to the digits that are known: in its own unit, else lengths in mm, angles in rad and °."""
-    unit, sd = block["unit"], block["sd"]
-    if own := own_unit(block):
-        return f"{value / own[0]:.{_decimals(sd / own[0])}f} {own[1]}"
-    if unit == "m":
-        scale, shown = display_unit("m", 1.0)
-        return f"{value / scale:.{_decimals(sd / scale)}f} {shown}"
-    text = f"{value:.{_decimals(sd)}f} {unit_text(unit)}".removesuffix(" 1").strip()
-    degrees = math.degrees(1.0)
-    return f"{text} = {value * degrees:.{_decimals(sd * degrees)}f}°" if unit == "rad" else text
-
-
-def _decimals(sd: float) -> int:
-    """Decimals down to a tenth of a standard deviation."""
-    return min(max(1 - math.floor(math.log10(sd)), 0), 12) if sd > 0 else 6
