@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
@@ -120,3 +122,27 @@ def is_shown(character: str) -> bool:
 def short_path(path: str) -> str:
     """A file's folder and name: enough to know it by, and nothing of the machine on which a page was made."""
     return "/".join(PurePath(path).parts[-2:])
+
+
+def typed_path(path: str) -> str:
+    """A path as it may be typed here: relative where it is below the current folder."""
+    near = os.path.relpath(path)
+    return path if near.startswith("..") else near
+
+
+def to_enter(block: Mapping[str, Any], value: float) -> str:
+    """A number to enter, to the digits that `sd` allows: in its own unit, else lengths in mm, angles in rad and °."""
+    unit, sd = block["unit"], block["sd"]
+    if own := own_unit(block):
+        return f"{value / own[0]:.{_decimals(sd / own[0])}f} {own[1]}"
+    if unit == "m":
+        scale, shown = display_unit("m", 1.0)
+        return f"{value / scale:.{_decimals(sd / scale)}f} {shown}"
+    text = f"{value:.{_decimals(sd)}f} {unit_text(unit)}".removesuffix(" 1").strip()
+    degrees = math.degrees(1.0)
+    return f"{text} = {value * degrees:.{_decimals(sd * degrees)}f}°" if unit == "rad" else text
+
+
+def _decimals(sd: float) -> int:
+    """Decimals down to a tenth of a standard deviation."""
+    return min(max(1 - math.floor(math.log10(sd)), 0), 12) if sd > 0 else 6

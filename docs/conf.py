@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -25,14 +26,24 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
     "sphinx_gallery.gen_gallery",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "screens",
 ]
-exclude_patterns = ["_build", "gallery"]
+exclude_patterns = ["_build", "_screens", "gallery"]
 html_theme = "furo"
 html_title = "ccnn_torch"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+# The button copies commands without their prompt, and nothing that they print.
+copybutton_prompt_text = "$ "
+copybutton_line_continuation_character = "\\"
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
+# The column at the right has the packages, not hundreds of methods.
+toc_object_entries = False
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
@@ -56,8 +67,9 @@ write_reference(HERE / "reference")
 
 
 def _escape(app: object, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
-    """A bar is a magnitude or an or, never a substitution of reStructuredText."""
+    """A bar is a magnitude or an or, never a substitution; of two names with one description the first is no type."""
     for i, line in enumerate(lines):
+        line = re.sub(r"^(:(?:ivar|param) )([^:]*, [^:]*):", lambda m: f"{m[1]}{m[2].replace(', ', ',')}:", line)
         parts = line.split("`")
         lines[i] = "`".join(part if k % 2 else part.replace("|", "\\|") for k, part in enumerate(parts))
 

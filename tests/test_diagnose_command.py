@@ -88,7 +88,7 @@ def test_a_folder_of_something_else_is_left_as_it_is(cli: Cli, rows: Path, tmp_p
 
 
 def test_check_says_what_rows_can_show_without_a_verdict(cli: Cli, rows: Path) -> None:
-    code, shown, _ = cli("check", "--records", rows, "--mechanism", "five_bar")
+    code, shown, _ = cli("check", "--records", rows, "--mechanism", "five_bar", "--details")
     assert code == 0
     assert "80 rows" in shown and "tool cannot be seen without" in shown
     # One line an effect, with the closest few of those that could take it over.
@@ -244,7 +244,7 @@ def test_columns_by_another_name_are_said(cli: Cli, rows: Path, tmp_path: Path) 
     text = rows.read_text(encoding="utf-8")
     rows.write_text(text.replace("load_x[", "force_x[", 1), encoding="utf-8")
     words = ("--records", rows, "--mechanism", "five_bar", "--effects", "backlash", "--no-network")
-    code, shown, _ = cli("diagnose", *words, "--out", tmp_path / "found")
+    code, shown, _ = cli("diagnose", *words, "--details", "--out", tmp_path / "found")
     assert code == 0
     notes = json.loads((tmp_path / "found" / "diagnosis.json").read_text(encoding="utf-8"))["notes"]
     assert any("not evaluated: force_x; effects use time, temperature, load_x" in note for note in notes)

@@ -20,7 +20,7 @@ from ccnn_torch.motion.servo import KEYS
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "ccnn_torch"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*/*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs").glob("*/*.md"))]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 CONSTANTS = ROOT / "docs" / "explanation" / "diagnosis_constants.md"
 
@@ -47,7 +47,7 @@ def test_every_constant_of_the_diagnosis_is_in_the_table_with_its_value() -> Non
         (path.relative_to(PACKAGE).with_suffix("").as_posix(), names, value)
         for pattern in ("evidence/*.py", "diagnosis/**/*.py", "motion/*.py")
         for path in PACKAGE.glob(pattern)
-        if "page" not in path.parts
+        if "page" not in path.relative_to(PACKAGE).parts
         for names, value in numeric_constants(path)
     }
     assert set(table) == code
@@ -102,7 +102,7 @@ def test_every_command_on_the_pages_is_one_that_there_is() -> None:
     for page in PAGES:
         if page.parent.name == "reference":
             continue
-        text = "\n".join(blocks(page, "bash") + blocks(page, ""))
+        text = "\n".join(blocks(page, "bash") + blocks(page, "{screen}") + blocks(page, ""))
         for line in text.replace("\\\n", " ").splitlines():
             command = line.partition("&& ccnn ")[2] or (line[5:] if line.startswith("ccnn ") else "")
             if not command:
@@ -113,3 +113,14 @@ def test_every_command_on_the_pages_is_one_that_there_is() -> None:
                 group.commands[name].make_context(name, words)  # type: ignore[attr-defined]
                 parsed += 1
     assert parsed > 25
+
+
+def test_every_public_name_has_one_line_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    from reference.generate import first_line, public_names
+
+    lines = {f"{package}.{name}": first_line(thing) for package, own in public_names().items() for name, thing in own}
+    assert len(lines) > 100
+    for name, line in lines.items():
+        assert line.endswith(".") and len(line) <= 140, f"{name}: {line}"
+        assert not re.search(r"(^|[^\w`])_\w", line), f"{name}: {line}"

@@ -171,7 +171,7 @@ class RunConfig(JobConfig):
     split: SplitConfig = Field(default_factory=SplitConfig)
     case: Literal["tripod", "machine_tool", "realistic"] | None = Field(
         default=None,
-        description="simulated data: a case study of paper 000, tripod or machine_tool; a realistic machine; or null "
+        description="simulated data: a case study of the paper, tripod or machine_tool; a realistic machine; or null "
         "and records instead",
     )
     realistic: RealisticConfig = Field(default_factory=RealisticConfig)

@@ -203,7 +203,7 @@ Mask = NDArray[np.bool_]
 
 
 def alive_nodes(masks: Sequence[Mask]) -> list[Mask]:
-    """Which nodes carry a signal from an input to an output (paper 000, section III-E).
+    """Which nodes carry a signal from an input to an output (Zhang and Gao 2012, section III-E).
 
     A hidden node without a living input or without a living output is dead, and so on through the layers.
 

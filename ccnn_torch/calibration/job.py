@@ -24,6 +24,7 @@ from ccnn_torch.calibration.prepare import Prepared, TooManyRepeatsError, prepar
 from ccnn_torch.calibration.result import by_score, plan_of
 from ccnn_torch.calibration.statistics import reach_block, share_unit, spread
 from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.display import typed_path
 from ccnn_torch.engine import Failure, Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError, WriteError
 from ccnn_torch.mechanisms import Instrument
@@ -73,10 +74,10 @@ def finish_runs(runs: Mapping[str, RunConfig], engine: str, quiet: bool) -> dict
 
 def _finish(config: RunConfig, quiet: bool) -> str:
     """Start or resume a run without its tables; returns a line about the errors of its methods."""
-    return errors_line(RunResults.read(RUN.finish(config, quiet, tables=False).results))
+    return errors_line(RunResults.read(RUN.finish(config, quiet, details=None).results))
 
 
-def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, tables: bool) -> None:
+def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, details: bool | None) -> None:
     """Run the blocks that are not finished yet, and put their figures together."""
     with resume_hint(f"ccnn run --resume {folder.path}"):
         blocks = blocks_of(config, folder)
@@ -87,15 +88,15 @@ def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, tables: bool)
                 f"block {name}: {problem.text}; {len(blocks) - len(failed)} of {len(blocks)} blocks are finished and "
                 f"kept, and ccnn run --resume {folder.path} resumes from them"
             )
-        write_blocks(config, folder, list(blocks.values()), lambda path: RUN.resume(path, quiet=True, tables=False))
-    if tables and not quiet:
-        run_page(RunResults.read(folder.results)).show(stdout)
-        say_place(f"Everything is in {folder.path}")
+        write_blocks(config, folder, list(blocks.values()), lambda path: RUN.resume(path, quiet=True, details=None))
+    if details is not None and not quiet:
+        run_page(RunResults.read(folder.results)).show(stdout, details)
+        say_place(f"Everything is in {typed_path(str(folder.path))}")
 
 
-def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet: bool, tables: bool) -> None:
+def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet: bool, details: bool | None) -> None:
     if prepared is None:
-        _run_blocks(config, folder, quiet, tables)
+        _run_blocks(config, folder, quiet, details)
         return
     for sentence in prepared.notes:
         note(sentence, quiet)
@@ -127,9 +128,10 @@ def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet:
         except WriteError:
             run_page(calibration.results).show(stdout)
             raise
-    if tables and not quiet:
-        run_page(calibration.results).show(stdout)
-        say_place(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")
+    if details is not None and not quiet:
+        run_page(calibration.results).show(stdout, details)
+        place = typed_path(str(folder.path))
+        say_place(f"Everything is in {place}; open {place}/report.html")
 
 
 RUN = FolderJob("ccnn run", RunConfig, "results.json", "checkpoints/*.safetensors", _prepared, _run)

@@ -15,7 +15,7 @@ from typing import Any
 from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.files.write import write_rows, write_whole
 from ccnn_torch.files.yaml_file import read_yaml
-from ccnn_torch.report.page import InlineFigure, Page, sections_of
+from ccnn_torch.report.page import Answer, InlineFigure, Page, sections_of
 from ccnn_torch.report.results.base import Spread, interval_text, removed_percent
 from ccnn_torch.report.results.run import Before, Method, MethodPose, ModelFiles, Mse, RmsMax, RunResults
 from ccnn_torch.report.table import Table, table_of
@@ -40,7 +40,7 @@ def run_page(results: RunResults, figures: Sequence[InlineFigure] = ()) -> Page:
         name=results.name,
         kind="calibration report",
         verdict=verdict(results),
-        sections=sections_of(result_tables(results), figures),
+        sections=sections_of(result_tables(results), figures, _answers(results)),
         facts=facts + f" · case {results.case} of the paper" if results.case else facts,
         cautions=[*([worse] if worse else []), *failures(results)],
         notes=results.notes,
@@ -48,6 +48,20 @@ def run_page(results: RunResults, figures: Sequence[InlineFigure] = ()) -> Page:
         best=results.best_method,
         worse=bool(worse),
     )
+
+
+def _answers(results: RunResults) -> list[Answer]:
+    """What each part of the model leaves of the RMS position error, where it has parts."""
+    position, best = results.pose.position, results.best_method
+    if best is None or not results.pose.parts:
+        return []
+    steps = [("as it is", position.before), *((part, position[part]) for part in results.pose.parts)]
+    told = []
+    for name, block in [*steps, (best, position.after)]:
+        scale, unit = display_unit("m", block.rms.median or 0.0)
+        size = number_text(None if block.rms.median is None else block.rms.median / scale, 3)
+        told.append(f"{size} {unit} {name}" if name == "as it is" else f"with {name} {size} {unit}")
+    return [Answer("Step by step", f"{', '.join(told)} (RMS position error on held-out rows).")]
 
 
 def verdict(results: RunResults) -> str:
@@ -124,6 +138,11 @@ def worse_text(results: RunResults) -> str:
     left, right, unit = _both(alone, after)
     instead = " + ".join(parts) + " alone" if parts else "no correction at all"
     text = f"On held-out rows {best} makes it worse than {instead} ({left} → {right} {unit} RMS position error)"
+    if parts and position.explained is not None and (position.explained.rms.median or after) <= _WORSE * alone:
+        return (
+            f"{text}: the model is right, but its file holds commands back near singular poses; ccnn identify, then "
+            "ccnn compensate identified.yaml, commands by the geometry."
+        )
     if best == "constant":
         return f"{text}: what it learned of the training rows does not hold on others."
     return f"{text}: methods=constant leaves the network out, methods=auto chooses by cross-validation."
@@ -264,11 +283,7 @@ def _pose_table(results: RunResults) -> Table:
                 "Not explained: what the model leaves of the poses at the joints as commanded; after: what is left "
                 "under the commands of the file.",
             ),
-            (
-                "not_compensable",
-                "RMS not compensable",
-                "Not compensable: the part of the measured error that the (damped) joint deviations do not explain.",
-            ),
+            ("not_compensable", "RMS not compensable", "Not compensable: what no command of the joints can remove."),
         )
         if any(block[extra[0]] is not None for block in blocks.values())
     ]

@@ -154,8 +154,8 @@ def chosen_by(config: RunConfig, prepared: Prepared, outcome: Outcome) -> Litera
 def _notes(plan: Plan) -> list[str]:
     if not plan.holds_out:
         return [
-            "No rows were held out for choices: the predictive sd is the learner's own, not corrected on "
-            "other rows (training.folds=5 does that without changing the model)."
+            "No rows were held out to check the predictive standard deviation; training.folds=5 does so without "
+            "changing the model."
         ]
     if plan.folds > 1:
         blocks = "neighbouring blocks" if plan.kind == "block" else "whole groups" * (plan.kind == "group") or "rows"

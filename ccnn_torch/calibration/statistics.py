@@ -43,7 +43,7 @@ def share_unit(joints: Sequence[Coordinate]) -> bool:
 def joint_errors(
     predicted: ArrayLike, measured: ArrayLike, weights: ArrayLike | None, joints: Sequence[Coordinate]
 ) -> dict[str, Errors]:
-    """Mean squared, mean absolute and summed squared error, as in Tables II and IV of paper 000.
+    """Mean squared, mean absolute and summed squared error, as in Tables II and IV of the paper.
 
     A joint's mse and mae are means over the rows and its sse the sum. `all` holds the mean over rows and joints (mse,
     mae) and the sum over both (sse): the paper's columns "All joints" are exactly that. `all` is left out when the
@@ -88,7 +88,7 @@ def constant_errors(
 
 
 def before_block(deviations: ArrayLike, weights: ArrayLike | None, joints: Sequence[Coordinate]) -> dict[str, Before]:
-    """Mean and maximum of each joint's error before calibration (Tables I and III of paper 000).
+    """Mean and maximum of each joint's error before calibration (Tables I and III of the paper).
 
     Both are of the *signed* error: the paper's ρ3 has mean -9.36e-5 and maximum -6.68e-5, which only the algebraically
     largest error can be. `max_abs` is the largest by absolute value, which is what a user fears.

@@ -11,8 +11,9 @@ from typing import Annotated
 import typer
 
 from ccnn_torch.cli.from_records import check, diagnose, identify, new, run
+from ccnn_torch.cli.start import start
 from ccnn_torch.cli.studies import blind_check, compare, keys, plan, simulate, suite, sweep
-from ccnn_torch.cli.with_model import compensate, export, picture, sign, verify
+from ccnn_torch.cli.with_model import compensate, export, picture, report, sign, verify
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError, MethodFailedError, out_of_memory
 from ccnn_torch.run_folder.folder import Stopped
@@ -45,6 +46,7 @@ def _common(
 
 
 for _command in (
+    start,
     new,
     run,
     suite,
@@ -59,6 +61,7 @@ for _command in (
     diagnose,
     check,
     blind_check,
+    report,
     picture,
     sign,
     keys,

@@ -11,6 +11,7 @@ import typer
 from ccnn_torch.cli.options import (
     Config,
     ConfigOption,
+    Details,
     Effects,
     Mechanism,
     Noise,
@@ -112,6 +113,7 @@ def run(
     resume: Resume = None,
     out: Out = None,
     seed: Seed = None,
+    details: Details = False,
     quiet: Quiet = False,
 ) -> None:
     """Train on a case study or on measured records; write tables, curves, plots and model files into a run folder.
@@ -140,7 +142,7 @@ def run(
         read_yaml(file)
     from ccnn_torch.calibration.job import RUN
 
-    _start_or_resume(RUN, "tripod", file, changes, resume, quiet)
+    _start_or_resume(RUN, "tripod", file, changes, resume, quiet, details)
 
 
 def identify(
@@ -153,6 +155,7 @@ def identify(
     out: Out = None,
     seed: Seed = None,
     keys: Annotated[bool, typer.Option("--keys", help="List every key with its default, and exit.")] = False,
+    details: Details = False,
     quiet: Quiet = False,
 ) -> None:
     """Identify a machine's geometry: parameters with intervals, unidentifiable parameters, held-out pose error.
@@ -185,21 +188,27 @@ def identify(
         return
     words = [config, *(overrides or [])]
     file, changes = config_and_changes(words, config_option, records=records, mechanism=mechanism, out=out, seed=seed)
-    _start_or_resume(IDENTIFY, "five_bar", file, changes, resume, quiet)
+    _start_or_resume(IDENTIFY, "five_bar", file, changes, resume, quiet, details)
 
 
 def _start_or_resume(
-    job: FolderJob[Any, Any], example: str, file: Path | None, changes: list[str], resume: Path | None, quiet: bool
+    job: FolderJob[Any, Any],
+    example: str,
+    file: Path | None,
+    changes: list[str],
+    resume: Path | None,
+    quiet: bool,
+    details: bool,
 ) -> None:
     if resume is not None:
         if changes or file is not None:
             raise InputError("--resume takes the folder alone, without CONFIG, overrides and other options")
-        job.resume(resume, quiet)
+        job.resume(resume, quiet, details)
         return
     if file is None and not changes:
         example = f"{job.command} experiments/{example}.yaml"
         raise InputError(f"name a config, for example: {example} (or --resume DIR)")
-    job.start(job.model.from_file(file, changes, noted(quiet)), quiet)
+    job.start(job.model.from_file(file, changes, noted(quiet)), quiet, details)
 
 
 def diagnose(
@@ -222,7 +231,7 @@ def diagnose(
         Path | None,
         typer.Option(metavar="MODEL", help="Tell what changed since this model was made, from a few new rows."),
     ] = None,
-    details: Annotated[bool, typer.Option("--details", help="Show all tables as well.")] = False,
+    details: Details = False,
     quiet: Quiet = False,
 ) -> None:
     """Find the physical effect that explains the error of a model, and how much of the error it removes.
@@ -308,6 +317,7 @@ def check(
     effects: Effects = None,
     config: ConfigOption = None,
     seed: Seed = None,
+    details: Details = False,
     quiet: Quiet = False,
 ) -> None:
     """Report which effects records can identify: rows, noise, covariates, unidentifiable effects, confusable pairs.
@@ -334,7 +344,7 @@ def check(
     if not quiet:
         for line in check_text(found):
             say(line)
-        if found.confusable:
+        if details and found.confusable:
             print_table(check_table(found), stdout)
     if wanted.out is not None:
         write_check(Path(wanted.out), found)

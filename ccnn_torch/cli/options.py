@@ -39,6 +39,7 @@ Out = Annotated[str | None, typer.Option(help="Folder to write; the same as out=
 OutFolder = Annotated[Path, typer.Option(help="Folder to write.")]
 Seed = Annotated[int | None, typer.Option(help="Random seed; the same as seed=….")]
 Resume = Annotated[Path | None, typer.Option(help="Resume the work in this folder.")]
+Details = Annotated[bool, typer.Option("--details", help="Show all tables as well.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 Noise = Annotated[
     str | None,

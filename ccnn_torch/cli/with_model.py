@@ -1,4 +1,4 @@
-"""Commands on the file of a model: compensate, export, verify, sign; and on a run folder: picture."""
+"""Commands on the file of a model: compensate, export, verify, sign; and on a folder: report, picture."""
 
 from __future__ import annotations
 
@@ -348,6 +348,30 @@ def sign(
         message = f"{sign_model(model, key)}: written; pass it on with {model.name} and its card."
     if not quiet:
         typer.echo(message)
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, diagnosis, identification, check …")],
+    quiet: Quiet = False,
+) -> None:
+    """Open the page of a folder in the browser; without a display its path is printed.
+
+    Example:
+
+    ccnn report runs/tripod
+    """
+    import sys
+    import webbrowser
+
+    page = next((folder / name for name in ("report.html", "verify.html") if (folder / name).is_file()), None)
+    if page is None:
+        raise InputError(f"{folder}: has no report.html or verify.html; name a folder that a command has filled")
+    # On Linux a browser that needs no display would take the terminal.
+    shows = not sys.platform.startswith("linux") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if shows:
+        webbrowser.open(page.resolve().as_uri())
+    if not quiet:
+        typer.echo(page)
 
 
 def picture(

@@ -27,7 +27,7 @@ Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
 
 
 class Solution(NamedTuple):
-    """Both directions at once, since the first step of the one is the other.
+    """Command and way back, solved together.
 
     Attributes:
         command: joints to command for the ideal joints given, `... x n` [SI].
@@ -50,7 +50,7 @@ class Solution(NamedTuple):
 
 
 class Compensator(nn.Module):
-    """A learned deviation δ(q) of commanded joints, guarded and limited, with the command that undoes it.
+    """The correction of commanded joints: a bounded deviation δ(q), and the command that undoes it.
 
     Sign: δ is what the machine does beyond the command, ideal = q + δ(q); the command for ideal joints q* solves
     q + δ(q) = q* by `iterations` steps from q*: of q ← q* - δ(q), or with `secant` of Broyden's method, which gains
@@ -63,7 +63,7 @@ class Compensator(nn.Module):
     deviation is bounded by `most`. With `geometry` and `effects`, the expansions of machines without closed forms, r(q)
     the network's guarded part and γ(q) their deviation, δ(q) = r(q) + γ(q + r(q)), which fades with r.
 
-    `sd` says how far a newly measured δ may be from this one: inside the domain by the network's own `variance`
+    `sd` is the standard deviation of a newly measured δ about it: inside the domain by the network's own `variance`
     and `sd_scale`, outside by how the training deviations scatter about `safe`, between the two by the guard's weight.
 
     Attributes:

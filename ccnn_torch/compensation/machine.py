@@ -58,7 +58,9 @@ RULE = Rule()
 
 
 class Machine(nn.Module):
-    """f(q, c) = P(F(q + e_joints(q, c); θ), c), and the joints that minimise |W (f(c) - X)|² + λ² |c - q|² for the
+    """The identified machine, and the commands at which it reaches the nominal pose of ideal joints.
+
+    f(q, c) = P(F(q + e_joints(q, c); θ), c), and the joints that minimise |W (f(c) - X)|² + λ² |c - q|² for the
     nominal pose X of ideal joints q; of serial arms and of others whose forward kinematics is a closed form.
 
     λ is fixed at q: 0 where no singular pose is near, so that the machine reaches X; the deviation is damped, not the

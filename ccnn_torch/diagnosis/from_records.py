@@ -66,7 +66,7 @@ def diagnose(
     seed: int = 0,
     network: bool = False,
 ) -> Diagnosis:
-    """Which effect makes the gap between a model and measured records, where it is, the share of it that they explain.
+    """Find the effects that cause the error of a model on measured records, where they are, and how much they explain.
 
     Args:
         records: as `load_records` reads them, or a pandas DataFrame with headers ``name[unit]``.

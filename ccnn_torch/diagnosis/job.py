@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -15,12 +14,13 @@ from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of, wi
 from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
 from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
 from ccnn_torch.diagnosis.from_records import naming
-from ccnn_torch.diagnosis.page.data import RESULT, about_of, load_labels
+from ccnn_torch.diagnosis.page.data import RESULT, About, about_of, load_labels
+from ccnn_torch.diagnosis.page.first_screen import first_screen
 from ccnn_torch.diagnosis.page.outputs import write_diagnosis, write_result
 from ccnn_torch.diagnosis.page.report import print_diagnosis
 from ccnn_torch.diagnosis.progress import TO_REPORT, TO_VERDICT, watched
 from ccnn_torch.diagnosis.result import Said
-from ccnn_torch.display import short_path
+from ccnn_torch.display import short_path, typed_path
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.time import Homing
 from ccnn_torch.errors import InputError
@@ -29,7 +29,7 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism, simulated_rows
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.screen import say_place, stdout, step_bar
-from ccnn_torch.report.table import print_text
+from ccnn_torch.report.table import print_labelled
 from ccnn_torch.run_folder.folder import if_stopped, locked
 
 _Found = TypeVar("_Found", bound=Said)
@@ -77,11 +77,12 @@ def run_job(job: Job[_Found], config: DiagnoseConfig, quiet: bool, details: bool
             kept = write_result(folder, said)
             with if_stopped(f"interrupted after the verdict, which is kept in {kept}; the rest is not complete"):
                 if not quiet:
-                    print_text(said.verdict["text"], stdout, "bold")
+                    first = first_screen(said.to_json(), About())[0]
+                    print_labelled(first.label, first.text, stdout)
                 beside = job.complete(config, folder, said, quiet)
                 if not quiet:
                     results = read_json(kept)
-                    print_diagnosis(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
+                    print_diagnosis(results, stdout, about_of(load_labels(folder)), begun=True, details=details)
                     say_place(f"Written: {typed_path(str(kept))}, and beside it {', '.join(beside)}")
     except InputError:
         print_diagnosis(said.to_json(), stdout)
@@ -185,19 +186,10 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
         model = shlex.quote(f"{keys['out']}/model.onnx")
         sentence = "No model holds these effects by themselves: these lines learn the gap and correct targets."
         return sentence, run, f"ccnn compensate {model} TARGETS.csv COMMANDS.csv"
-    sentence = (
-        "The first line corrects targets by the machine with these effects alone, the second one fits all effects that "
-        "pay, and learns what they leave where that pays."
-    )
+    sentence = "the first line corrects targets by these effects alone, the second one trains a model of all that pays."
     return sentence, f"ccnn compensate {shlex.quote(typed_path(str(path)))} TARGETS.csv COMMANDS.csv", run
 
 
 def _records(config: DiagnoseConfig) -> str:
     files = config.records if isinstance(config.records, list) else [str(config.records)]
     return ",".join(typed_path(file) for file in files)
-
-
-def typed_path(path: str) -> str:
-    """A path as it may be typed here: relative where it is below the current folder."""
-    near = os.path.relpath(path)
-    return path if near.startswith("..") else near

@@ -35,7 +35,7 @@ class Frame(Effect):
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """A base frame that is known; an unknown one is fitted before anything else."""
         unknown = "base" in getattr(mechanism, "unknown_frames", ())
-        return f"a known base frame: that of {mechanism.name} is fitted to the records anyhow" if unknown else ""
+        return "a known base frame, which is fitted to the records here" if unknown else ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """As many of shift and turn as the pose shows."""
@@ -65,7 +65,7 @@ class Tool(Effect):
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """A platform that turns, and a tool frame that is known; an unknown one is fitted before anything else."""
         if "tool" in getattr(mechanism, "unknown_frames", ()):
-            return f"a known tool frame: that of {mechanism.name} is fitted to the records anyhow"
+            return "a known tool frame, which is fitted to the records here"
         if sees_directions(mechanism):
             return "positions: to directions a shift of the tool is an error of the last link"
         whole = inside(mechanism)

@@ -214,7 +214,7 @@ def _hint(error: BaseException | None, given: object) -> str:
 
 
 def missing_on(effect: Effect, situation: Situation) -> str:
-    """What the rows lack for an effect, as `Effect.missing` states it; a user's own is tried on them where that is ''.
+    """Columns that the rows lack for an effect, as a sentence; empty where they lack none.
 
     Args:
         effect: as `make_effect` or `owned` gives it; the library's are not tried.

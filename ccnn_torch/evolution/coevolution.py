@@ -1,4 +1,4 @@
-"""Cooperative coevolution of the layers of a network (paper 000, section III-A and F), all repeats at once.
+"""Cooperative coevolution of the layers of a network (Zhang and Gao 2012, section III-A and F), all repeats at once.
 
 An individual is evaluated in `k` complete networks: set k of representatives with the individual in its own layer. What
 joined networks share is computed once: layers before the individual once a set, and layers after it as one wide matrix

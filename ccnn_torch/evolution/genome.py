@@ -1,4 +1,4 @@
-"""Genomes of a subpopulation: encoding, selection, crossover, mutation, breeding (paper 000, sections III-B to F).
+"""Genomes of a subpopulation: encoding, selection, crossover, mutation, breeding (the paper, sections III-B to F).
 
 Bits are in row order (row = node of the later layer). The weight string holds the weight of every 1, in the same
 order; where the network has biases, a node's bias follows the weights of its row.
@@ -204,7 +204,7 @@ def nonuniform_mutation(
     return Genome(genome.mask, torch.where(chosen & active(genome), stepped, genome.weight))
 
 
-# What paper 000 leaves open and what made no difference on its cases: contestants of one tournament, cut points of a
+# What the paper leaves open and what made no difference on its cases: contestants of one tournament, cut points of a
 # crossover. b of eq. 13 is the paper's.
 CONTESTANTS, CUTS, EXPONENT = 3, 2, 2.0
 

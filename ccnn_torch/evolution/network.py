@@ -1,4 +1,4 @@
-"""Masked networks with periodic nodes: forward pass, dead nodes (paper 000, section III-E), averages, pruning."""
+"""Masked networks with periodic nodes: forward pass, dead nodes (the paper, section III-E), averages, pruning."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ _RIVAL, _RIVAL_OUTPUTS = (12, 12), 3
 
 @dataclass(frozen=True)
 class CCNNSettings:
-    """Settings of the CCNN. Defaults are for users; figures of paper 000 (section IV-A) are given beside them.
+    """Settings of the CCNN. Defaults are for users; figures of the paper (section IV-A) are given beside them.
 
     Attributes:
         hidden: nodes of each hidden layer; null = one layer of 8 nodes for each output, at least 24. The paper has two

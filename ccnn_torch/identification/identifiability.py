@@ -89,7 +89,7 @@ _RANK = 1e-9
 
 @dataclass(frozen=True)
 class Knowledge:
-    """Of `r` machines and `k` parameters.
+    """What rows determine of `r` machines and `k` parameters: standard errors, correlations, open directions.
 
     Attributes:
         parameters: the free ones.
@@ -201,7 +201,7 @@ def _noise(
 
 
 def require_identifiable(knowledge: Knowledge) -> None:
-    """For what needs every parameter.
+    """Refuse rows that leave a parameter open, for what needs every one.
 
     Raises:
         InputError: the identification matrix is singular; the sentence names the parameters that are determined.

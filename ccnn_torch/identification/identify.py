@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.config.split import Given
+from ccnn_torch.display import typed_path
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Fit, Progress
@@ -249,7 +250,7 @@ def write_outputs(found: Identification, folder: Path) -> None:
     write_json(folder / RESULTS, IdentifiedResults.model_validate(results))
 
 
-def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, tables: bool) -> None:
+def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, details: bool | None) -> None:
     path = folder.path
     with progress_bar(quiet) as bar:
 
@@ -258,14 +259,15 @@ def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, ta
             return lambda done: bar.update(task, completed=done)
 
         found = identify(config, path / "methods", watch)
-    if tables and not quiet:
+    if details is not None and not quiet:
         # Before anything is written: what was found is not lost where the disk is full.
-        identified_page(found.results).show(stdout)
+        identified_page(found.results, folder=typed_path(str(path))).show(stdout, details)
     note("writing tables, plots and files …", quiet)
     with resume_hint(f"ccnn identify --resume {path}"):
         write_outputs(found, path)
     if not quiet:
-        say_place(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
+        place = typed_path(str(path))
+        say_place(f"Everything is in {place}" + (f"; open {place}/report.html" if config.save_report else ""))
     if found.results["methods"][found.results["method"]]["converged"] == 0:
         why = " ".join([not_settled(found.results), *found.results["doubts"]])
         raise MethodFailedError(

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ccnn_torch.display import count_text, display_unit, number_text, own_unit
+from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter
 from ccnn_torch.files.write import write_rows
 from ccnn_torch.identification.judge import figure_text
 from ccnn_torch.identification.klipper import printer_table
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
 from ccnn_torch.report.json_files import read_json
-from ccnn_torch.report.page import InlineFigure, Page, sections_of
+from ccnn_torch.report.page import Answer, InlineFigure, Page, Section, sections_of
 from ccnn_torch.report.table import Table, table_of
 
+_Z95 = 1.96
+# Values on a screen.
+_LINES = 6
 BEFORE_SAYS = "Before: links nominal, what is unknown of frames, tool and instrument fitted."
 _HOLDERS = {
     "sockets": "the other rows of its socket put",
@@ -96,16 +100,27 @@ def identified_verdict(results: Block) -> str:
     machines = f" of {results['machines']} machines" if results["machines"] > 1 else ""
     if "constraint" in results:
         rows = count_text(results["rows"]["test"], "held-out row")
-        text = f"On {rows} {method} brings the tool nearer to where {holder(results)} it: "
+        text = f"On {rows} the tool is nearer to where {holder(results)} it: "
     else:
-        text = f"On {rows}{machines} {method} brings the predicted pose nearer to the measured one: "
+        text = f"On {rows}{machines} the predicted pose is nearer to the measured one: "
     if results["methods"][method]["converged"] == 0:
         return f"{failed} Its error on {rows}{machines}: {', '.join(parts)}."
-    text = f"{failed} {text}".lstrip() + ", ".join(parts)
+    return f"{failed} {text}".lstrip() + ", ".join(parts) + "."
+
+
+def _known(results: Block) -> str:
+    """How many values the rows determine one by one."""
     free = _free(results)
     lost = sum(not p["identifiable"] for p in free.values())
-    text += f"; {len(free) - lost} of {len(free)} parameters are identified"
-    return text + (f", {lost} are not determined by these rows." if lost else ".")
+    if results["methods"][results["method"]]["converged"] == 0:
+        return "none: the search did not converge."
+    if not lost:
+        return f"all {len(free)} values are determined."
+    move = "moves" if lost == 1 else "move"
+    return (
+        f"{len(free) - lost} of {len(free)} values are determined one by one; {lost} {move} together with others, and "
+        "predictions are not affected: the report lists them."
+    )
 
 
 def not_settled(results: Block) -> str:
@@ -134,8 +149,38 @@ def identified_tables(results: Block) -> list[Table]:
     return [table for table in tables if table is not None]
 
 
-def identified_page(results: Block, figures: Sequence[InlineFigure] = ()) -> Page:
-    """All that an identification shows."""
+def _answers(results: Block, folder: str | None) -> list[Answer]:
+    """What is known, what to enter in a printer's firmware, and what to do next."""
+    printer = printer_table(results)
+    lines = () if printer or results["simulated"] else tuple(_clearest(results))
+    said = [Answer("What is known", _known(results), lines)]
+    if printer is not None:
+        sections: dict[str, list[str]] = {}
+        for section, key, _, write in printer.rows:
+            sections.setdefault(section or [*sections][-1], []).append(f"{key} {write}")
+        lines = tuple(f"{section} {', '.join(keys)}" for section, keys in sections.items())
+        said.append(Answer("Enter in printer.cfg", printer.note, lines))
+    if folder is not None and not results["simulated"] and results["methods"][results["method"]]["converged"]:
+        line = f"ccnn compensate {shlex.quote(f'{folder}/identified.yaml')} TARGETS.csv COMMANDS.csv --pose"
+        said.append(Answer("Next", "correct targets by the identified machine.", (line,)))
+    return said
+
+
+def _clearest(results: Block) -> Iterator[str]:
+    """The values that are determined best against how far they moved, a line each."""
+    known = {name: block for name, block in _free(results).items() if block["identifiable"] and block["sd"]}
+    # Frames are where instrument and target stood, nothing to enter.
+    own = [name for name in known if not name.startswith(("base_", "tool_"))]
+    own.sort(key=lambda name: -abs(known[name]["value"] - known[name]["nominal"]) / known[name]["sd"])
+    for name in own[:_LINES]:
+        block = known[name]
+        half = _Z95 * block["sd"]
+        scale, unit = own_unit(block) or display_unit(block["unit"], half)
+        yield f"{name}: {to_enter(block, block['value'])} ± {number_text(half / scale, 2)} {unit}"
+
+
+def identified_page(results: Block, figures: Sequence[InlineFigure] = (), folder: str | None = None) -> Page:
+    """All that an identification shows; with its folder, on a screen, also the next command."""
     rows, machines = results["rows"], results["machines"]
     legs = "".join(f", {count} for leg {leg}" for leg, count in sorted(rows["per_leg"].items()))
     how = f"{count_text(machines, 'machine')} {'simulated' if results['simulated'] else 'measured'}"
@@ -143,20 +188,19 @@ def identified_page(results: Block, figures: Sequence[InlineFigure] = ()) -> Pag
         name=results["name"],
         kind="identification report",
         verdict=identified_verdict(results),
-        sections=sections_of(identified_tables(results), figures),
+        sections=[*sections_of(identified_tables(results), figures, _answers(results, folder)), *_together(results)],
         facts=f"{results['mechanism']} · {rows['train']} poses to identify from{legs}, {rows['test']} held-out poses · "
         f"{how} · seed {results['seed']}",
-        cautions=unknown_sentences(results),
+        cautions=results.get("doubts", []),
         notes=results["notes"],
         versions=results["versions"],
     )
 
 
-def unknown_sentences(results: Block) -> list[str]:
-    """What speaks against the figures, and which combinations of parameters the rows do not determine, as sentences."""
+def _together(results: Block) -> list[Section]:
+    """Which combinations of values the rows determine, where they do not determine each by itself."""
     found = results["combinations_not_identifiable"]
-    said = [f"Not identifiable from these rows: {'; '.join(found)}."] if found else []
-    return [*results.get("doubts", []), *said]
+    return [Section("Values that move together", sentences=[f"{text}." for text in found])] if found else []
 
 
 def _with_unit(block: Block, key: str) -> str:
@@ -214,7 +258,7 @@ def _parameter_table(results: Block) -> Table:
     if any("sd_bootstrap" in block for block in free.values()):
         columns["by bootstrap"] = column(lambda p, scale: figure_text(p, "sd_bootstrap", scale))
     several = results["machines"] > 1
-    note = f"By {results['method']}." + " Medians over the machines, [5 %, 95 %]." * several
+    note = f"Solver: {results['method']}." + " Medians over the machines, [5 %, 95 %]." * several
     return table_of("Parameters", columns, f"{note} {_interval_note(results)}", ["nominal"])
 
 
@@ -224,7 +268,7 @@ def _interval_note(results: Block) -> str:
         return "Without convergence there are no standard deviations."
     if results.get("doubts"):
         return "Standard deviations are for rows that fit the model and the noise, which these do not."
-    return "95 % of intervals of ±1.96 standard deviations hold the true value, if the geometry is all that is wrong."
+    return "The true value is within ±1.96 standard deviations with 95 %, if the geometry is all that is wrong."
 
 
 _SHOWN = (("before", "before"), ("after", "after"), ("mean_after", "mean after"), ("max_after", "maximum after"))

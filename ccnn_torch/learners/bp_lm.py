@@ -30,7 +30,7 @@ _STARTS = 0
 
 @dataclass(frozen=True)
 class BPLMSettings:
-    """Settings of BP-LM; paper 000 gives none of its own.
+    """Settings of BP-LM; the paper gives none of its own.
 
     Attributes:
         hidden: nodes of each hidden layer. Bayesian regularisation switches off what the rows do not ask for, so that

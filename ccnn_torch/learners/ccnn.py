@@ -1,4 +1,4 @@
-"""The cooperative coevolutionary network of paper 000 (section III) as a learner."""
+"""The cooperative coevolutionary network of the paper (section III) as a learner."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The evolutionary neural network (ENN) of paper 000, one population of whole networks, as a learner."""
+"""The evolutionary neural network (ENN) of the paper, one population of whole networks, as a learner."""
 
 from __future__ import annotations
 

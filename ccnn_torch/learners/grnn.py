@@ -26,7 +26,7 @@ _CAUTION = 1.5
 
 @dataclass(frozen=True)
 class GRNNSettings:
-    """Settings of the GRNN; paper 000 gives none of its own.
+    """Settings of the GRNN; the paper gives none of its own.
 
     Attributes:
         iterations: steps at most. The first judges one bandwidth for all inputs, each further one moves around the

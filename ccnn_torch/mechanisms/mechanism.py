@@ -50,7 +50,9 @@ class InverseKinematics(nn.Module):
 
 
 class Mechanism(nn.Module):
-    """Base class of mechanisms. A new one gives `closure`, `solve_inverse` or `forward_kinematics`; all else has a
+    """Base class of mechanisms.
+
+    A new one gives `closure`, `solve_inverse` or `forward_kinematics`; all else has a
     numerical default. Closed forms may leave out the argument `guess`.
 
     Everything is float64 and SI, broadcasts over leading dims, parameters included (`r x 1 x k` parameters and `s x n`

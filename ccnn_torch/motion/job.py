@@ -7,10 +7,11 @@ from pathlib import Path
 
 from ccnn_torch.config.sizes import size
 from ccnn_torch.diagnosis.config import DiagnoseConfig
-from ccnn_torch.diagnosis.job import Job, head_of, run_job, typed_path
+from ccnn_torch.diagnosis.job import Job, head_of, run_job
 from ccnn_torch.diagnosis.page.data import NEXT
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
 from ccnn_torch.diagnosis.verdict.text import in_doubt
+from ccnn_torch.display import typed_path
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_rows
 from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion

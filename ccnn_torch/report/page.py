@@ -7,12 +7,13 @@ anywhere, offline: tables and inline SVG, no script, nothing fetched.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
 
+from ccnn_torch.display import count_text
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.table import Table, markdown_table, print_labelled, print_table, print_text
 
@@ -26,12 +27,21 @@ class InlineFigure(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What is asked, sentences that answer it, and the command lines and the table that go with it."""
+    """What is asked, sentences that answer it, and the lines to copy and the table that go with it."""
 
     label: str
     text: str
     commands: tuple[str, ...] = ()
     table: Table | None = None
+
+
+class Card(NamedTuple):
+    """One thing that was found: its title, what it is, the numbers to enter, and what to look at."""
+
+    title: str
+    text: str
+    numbers: tuple[str, ...] = ()
+    look: str = ""
 
 
 @dataclass(frozen=True)
@@ -43,15 +53,18 @@ class Section:
     figures: Sequence[InlineFigure] = ()
     answers: Sequence[Answer] = ()
     sentences: Sequence[str] = ()
+    cards: Sequence[Card] = ()
 
-    def show(self, console: Console) -> None:
-        """Print it without its figures; a command line is never wrapped."""
+    def show(self, console: Console, details: bool = True) -> None:
+        """Print it without figures and cards, and without `details` the answers alone; no line to copy is wrapped."""
         for answer in self.answers:
             print_labelled(answer.label, answer.text, console)
             for command in answer.commands:
                 print_text(f"  {command}", console, wrap=False)
-            if answer.table is not None:
+            if details and answer.table is not None:
                 print_table(answer.table, console)
+        if not details:
+            return
         for table in self.tables:
             print_table(table, console)
         for sentence in self.sentences:
@@ -67,10 +80,14 @@ class Section:
         return [*parts, *map(markdown_table, tables), *self.sentences]
 
 
-def sections_of(tables: Iterable[Table | None], figures: Sequence[InlineFigure] = ()) -> list[Section]:
-    """A section for each table that is there, and one for all figures."""
-    found = [Section(table.title, (table,)) for table in tables if table is not None]
-    return [*found, Section("Figures", figures=figures)] if figures else found
+def sections_of(
+    tables: Iterable[Table | None], figures: Sequence[InlineFigure] = (), answers: Sequence[Answer] = ()
+) -> list[Section]:
+    """The first figure with the answers, a section for each table that is there, and one for all other figures."""
+    first = [Section(figures=figures[:1], answers=answers)] if answers else []
+    found = [*first, *(Section(table.title, (table,)) for table in tables if table is not None)]
+    rest = figures[1:] if answers else figures
+    return [*found, Section("Figures", figures=rest)] if rest else found
 
 
 @dataclass(frozen=True)
@@ -101,16 +118,22 @@ class Page:
     best: str | None = None
     worse: bool = False
 
-    def show(self, console: Console) -> None:
-        """Print sections, cautions and notes, and at last the verdict."""
-        for section in self.sections:
-            section.show(console)
-        for sentence in self.cautions:
-            print_text(sentence, console, "yellow")
-        for note in self.notes:
-            print_text(note, console, "dim")
+    def show(self, console: Console, details: bool = True) -> None:
+        """Print the tables and notes if there are to be `details`, then what matters: verdict, answers and cautions."""
+        if details:
+            for section in self.sections:
+                replace(section, answers=()).show(console)
+            for note in self.notes:
+                print_text(note, console, "dim")
         if self.verdict:
             print_text(self.verdict, console, "bold")
+        for section in self.sections:
+            replace(section, tables=(), sentences=()).show(console, details)
+        for sentence in self.cautions:
+            print_text(sentence, console, "yellow")
+        if not details:
+            rest = f"Tables and {count_text(len(self.notes), 'note')}" if self.notes else "Tables"
+            print_text(f"{rest} are in the report; --details shows them here.", console, "dim")
 
     def markdown(self) -> str:
         """Title, verdict, cautions, sections and notes."""

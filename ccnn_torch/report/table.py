@@ -110,7 +110,8 @@ def print_table(table: Table, console: Console) -> None:
     if table.note:
         print_text(table.note, console, "italic dim")
     if left_out := [column for i, column in enumerate(table.columns) if i not in shown]:
-        print_text(f"Columns left out on a terminal of this width: {', '.join(left_out)}.", console, "dim")
+        names = "; ".join(left_out)
+        print_text(f"A wider terminal, or the report, also has {len(left_out)} more columns: {names}.", console, "dim")
 
 
 def fitting_columns(table: Table, width: int) -> list[int]:

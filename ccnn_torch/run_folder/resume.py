@@ -46,7 +46,8 @@ class FolderJob(Generic[_Config, _Data]):
         results: the file that is written last.
         checkpoints: pattern of the files that hold the fingerprint of the config.
         prepare: checks a config before a folder is made; gives it as it is run, and its data.
-        compute: fills a folder from config and data; then `quiet` and whether `tables` are shown.
+        compute: fills a folder from config and data; then `quiet` and `details`, whether tables are shown
+            as well; None: no result at all.
     """
 
     command: str
@@ -54,9 +55,9 @@ class FolderJob(Generic[_Config, _Data]):
     results: str
     checkpoints: str
     prepare: Callable[[_Config], tuple[_Config, _Data]]
-    compute: Callable[[_Config, _Data, RunFolder, bool, bool], None]
+    compute: Callable[[_Config, _Data, RunFolder, bool, bool | None], None]
 
-    def start(self, config: _Config, quiet: bool = False, tables: bool = True) -> RunFolder:
+    def start(self, config: _Config, quiet: bool = False, details: bool | None = False) -> RunFolder:
         """Fill a fresh folder.
 
         Raises:
@@ -67,7 +68,7 @@ class FolderJob(Generic[_Config, _Data]):
         with RunFolder.fresh(config.out, config.name, f"{self.command} --resume") as folder:
             folder.write("config.yaml", config.to_yaml(folder.path))
             try:
-                self.compute(config, data, folder, quiet, tables)
+                self.compute(config, data, folder, quiet, details)
             except WriteError:
                 raise
             except InputError:
@@ -77,7 +78,7 @@ class FolderJob(Generic[_Config, _Data]):
                 raise
         return folder
 
-    def resume(self, path: Path, quiet: bool = False, tables: bool = True) -> RunFolder:
+    def resume(self, path: Path, quiet: bool = False, details: bool | None = False) -> RunFolder:
         """Finish what a folder holds, as if it was never stopped. What is finished stays as it is.
 
         Raises:
@@ -90,15 +91,15 @@ class FolderJob(Generic[_Config, _Data]):
         with RunFolder.existing(path, self.command) as folder:
             config = self.model.from_file(folder.config)
             check_fingerprint(sorted(path.glob(self.checkpoints)), fingerprint(config), folder.config)
-            self.compute(*self.prepare(config), folder, quiet, tables)
+            self.compute(*self.prepare(config), folder, quiet, details)
         return folder
 
-    def finish(self, config: _Config, quiet: bool = False, tables: bool = True) -> RunFolder:
+    def finish(self, config: _Config, quiet: bool = False, details: bool | None = False) -> RunFolder:
         """Resume the folder of a config where there is one, else start it."""
         folder = RunFolder(Path(str(config.out)))
         if folder.config.is_file():
-            return self.resume(folder.path, quiet, tables)
-        return self.start(config, quiet, tables)
+            return self.resume(folder.path, quiet, details)
+        return self.start(config, quiet, details)
 
 
 def fingerprint(config: FolderConfig, data: str | None = None) -> dict[str, Any]:

@@ -261,7 +261,7 @@ def _plain(value: Any) -> Any:
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class CCNNRegressor(SteppedRegressor):
-    """Cooperative coevolution of a masked network's layers, refined by Levenberg-Marquardt (paper 000, section III).
+    """Cooperative coevolution of a masked network's layers, refined by Levenberg-Marquardt (Zhang and Gao 2012).
 
     By default hidden, rival_hidden, population, generations, members and refinement_iterations stay below what a run
     has, which takes about ten times as long and predicts somewhat better. All settings:

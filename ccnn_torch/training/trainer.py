@@ -120,7 +120,7 @@ def interrupts_held_back() -> Iterator[None]:
 
 @dataclass
 class Training:
-    """What a training leaves behind; the learner itself holds the chosen state.
+    """Result of a training: history and times; the learner itself holds the chosen state.
 
     Attributes:
         step: steps done.
@@ -158,7 +158,7 @@ def train(
     budget: float | None = None,
     begin_from: dict[str, Tensor] | None = None,
 ) -> Training:
-    """Drive a learner to its end and leave it in the chosen state of every repeat.
+    """Train a learner with early stopping, and leave it in the chosen state of every repeat.
 
     With `data.validation`, each repeat is left in the state of its lowest validation error, and the loop ends early
     once no repeat has improved for `patience` steps. With `stop_at`, each repeat is left in the state after that many

@@ -55,7 +55,7 @@ def verify_text(results: VerifyResults) -> str:
     blocks = {kind: results[kind] for kind in _KINDS if results[kind] is not None}
     promised = {kind: block for kind, block in blocks.items() if block.promised is not None}
     rows = count_text(results.rows, "row")
-    how = "of the compensated machine" if results.compensated else "of the uncompensated machine"
+    how = "measured with the model in use" if results.compensated else "measured without compensation"
     left = " and ".join(_left(block, kind) for kind, block in blocks.items())
     if not promised:
         verdict = "is lower" if results.kept else "is not lower"
@@ -65,8 +65,9 @@ def verify_text(results: VerifyResults) -> str:
     broken = [kind for kind, block in promised.items() if block.after.rms > block.promised.high]
     limits = " and ".join(_limit(block, block.promised, kind) for kind, block in promised.items())
     if not broken:
-        return f"The promise is kept on {rows} {how}: {left}; promised: {limits}."
-    return f"The promise of the {' and the '.join(broken)} is not kept on {rows} {how}: {left}; promised: {limits}."
+        return f"The promise is kept on {rows} {how}: the model leaves {left}; promised: {limits}."
+    which = " and the ".join(broken)
+    return f"The promise of the {which} is not kept on {rows} {how}: the model leaves {left}; promised: {limits}."
 
 
 def verify_tables(results: VerifyResults) -> list[Table]:

@@ -14,7 +14,7 @@ import typer
 from ccnn_torch.cli.application import app
 from ccnn_torch.config.keys import keys_by_section
 
-__all__ = ["write_reference"]
+__all__ = ["first_line", "public_names", "write_reference"]
 
 CONTRACTS = Path(__file__).parents[2] / "tests" / "contracts"
 SCHEMAS = {
@@ -47,20 +47,43 @@ def write_reference(folder: Path) -> None:
             path.write_text(text, encoding="utf-8")
 
 
-def _api() -> str:
-    """Every public class and function, once: in the first package that gives it."""
-    parts = ["# Python\n", "Arrays are float64 and in SI units; `...` stands for any leading batch dimensions.\n"]
+def public_names() -> dict[str, list[tuple[str, Any]]]:
+    """By package every public function and class, functions first, each in the first package that gives it."""
+    found: dict[str, list[tuple[str, Any]]] = {}
     seen: set[int] = set()
     for package in PACKAGES:
         module = import_module(package)
         names = getattr(module, "__all__", None) or sorted(n for n in vars(module) if not n.startswith("_"))
-        found = {name: getattr(module, name) for name in names if name != "__version__"}
+        things = [(name, getattr(module, name)) for name in names if name != "__version__"]
+        own = [
+            (name, thing)
+            for name, thing in things
+            if (inspect.isclass(thing) or inspect.isfunction(thing))
+            and getattr(thing, "__module__", "").startswith("ccnn_torch")
+            and id(thing) not in seen
+        ]
+        seen |= {id(thing) for _, thing in own}
+        found[package] = sorted(own, key=lambda pair: (inspect.isclass(pair[1]), pair[0].lower()))
+    return found
+
+
+def first_line(thing: Any) -> str:
+    """The first paragraph of a docstring, on one line."""
+    return " ".join((inspect.getdoc(thing) or "").partition("\n\n")[0].split())
+
+
+def _api() -> str:
+    """A table of all names with a line each, and below it what each is."""
+    parts = ["# Python\n", "Arrays are float64 and in SI units; `...` stands for any leading batch dimensions.\n"]
+    packages = public_names()
+    for package, own in packages.items():
+        parts += [f"**{package}**\n", "| name | what it is |", "| --- | --- |"]
+        for name, thing in own:
+            parts.append(f"| {{py:obj}}`{name} <{package}.{name}>` | {_cell(first_line(thing))} |")
+        parts.append("")
+    for package, own in packages.items():
         parts += [f"## {package}\n", "```{eval-rst}"]
-        for name, thing in found.items():
-            ours = getattr(thing, "__module__", "").startswith("ccnn_torch")
-            if id(thing) in seen or not ours or not (inspect.isclass(thing) or inspect.isfunction(thing)):
-                continue
-            seen.add(id(thing))
+        for name, thing in own:
             kind = "autoclass" if inspect.isclass(thing) else "autofunction"
             # scikit-learn adds methods of its own to estimators, with links into its pages.
             members = "   :members: fit, predict" if package.endswith("sklearn") else "   :members:"

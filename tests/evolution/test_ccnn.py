@@ -30,7 +30,7 @@ def toy_data(seeds: list[int], rows: int = 30) -> TrainingData:
 
 
 def tripod_case(seeds: list[int]) -> tuple[TrainingData, Tensor, Tensor, Tensor, Scaling]:
-    """Case one of paper 000 from its equations: training data; test features, errors and noise; scaling."""
+    """Case one of the paper from its equations: training data; test features, errors and noise; scaling."""
     y, z, phi = (
         axis.flatten()
         for axis in np.meshgrid(

@@ -145,5 +145,5 @@ def test_bad_rows_are_named(keys: dict[str, object], said: str) -> None:
 
 def test_fewer_equations_than_parameters_are_refused() -> None:
     rows = measured(1, 5, 7)
-    with pytest.raises(InputError, match=r"5 rows of 2 equations cannot determine 12 .* measure at least 6 poses"):
+    with pytest.raises(InputError, match=r"5 rows of 2 equations cannot determine 12 .* measure at least 6 rows"):
         inverse_problem(rows.mechanism, rows.joints, rows.pose)

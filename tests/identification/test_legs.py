@@ -77,7 +77,5 @@ def test_a_leg_with_too_few_rows_is_refused() -> None:
     rows = measured(1, 4, 5)
     choice = ParameterChoice(fixed=["leg2.l2", "leg2.L2", "leg2.A*", "k2"])
     problem = inverse_problem(rows.mechanism, rows.joints, rows.pose, choice=choice, per_leg=True)
-    with pytest.raises(
-        InputError, match="4 rows of 1 equations cannot determine 6 free parameters; measure at least 6"
-    ):
+    with pytest.raises(InputError, match="4 rows of 1 equation cannot determine 6 free parameters; measure at least 6"):
         split_by_leg(problem)

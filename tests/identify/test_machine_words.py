@@ -46,8 +46,8 @@ def test_a_gantry_has_squareness_and_leads(seed: int, tmp_path: Path, cli: Cli) 
     numbers = _gantry(tmp_path, seed)
     out = tmp_path / "found"
     words = (f"records={tmp_path / 'gantry.csv'}", f"mechanism={tmp_path / 'gantry.yaml'}", "save_report=false")
-    code, screen, _ = cli("identify", *words, "--out", out)
-    assert code == 0 and "squareness xy [µm/m]" in screen and "18 of 18 parameters are identified" in screen
+    code, screen, _ = cli("identify", *words, "--details", "--out", out)
+    assert code == 0 and "squareness xy [µm/m]" in screen and "all 18 values are determined" in screen
     assert "squareness xy [µm/m]" in (out / "identified.md").read_text()
     rows = list(csv.DictReader((out / "identified.csv").read_text().splitlines()))
     told = {(r["name"], r["quantity"]): float(r["value"]) for r in rows if r["subject"] == "number"}
@@ -104,7 +104,7 @@ def test_straightness_is_found_beyond_a_known_table_and_commanded_away(tmp_path:
     table = "pitch_errors: {q1: {at: [0 mm, 300 mm, 1000 mm], error: [2 um, 14 um, -7 um]}}"
     machine.write_text(f"{template('gantry')}{table}\n")
     code, screen, told = cli(
-        "identify", f"records={records}", f"mechanism={machine}", "save_report=false", "--out", out
+        "identify", f"records={records}", f"mechanism={machine}", "save_report=false", "--details", "--out", out
     )
     assert code == 0, told
     assert "straightness EYX [µm]" in screen
@@ -206,7 +206,7 @@ def test_rails_stay_straight_by_the_tolerance_of_the_machine_file(tmp_path: Path
     words = (f"records={tmp_path / 'bed.csv'}", f"mechanism={_printer(tmp_path)}", "noise=10 um", "save_report=false")
     leans = {}
     for out, more in (("own", ()), ("wide", ("constraint={kind: pose, tolerance: {rad: 0.01}}",))):
-        code, screen, _ = cli("identify", *words, *more, "--out", tmp_path / out)
+        code, screen, _ = cli("identify", *words, *more, "--details", "--out", tmp_path / out)
         assert code == 0 and "printer.cfg (Klipper)" in screen and "endstop A [mm]" in screen
         # One radius, as in the firmware: three of them and three angles would move and turn the whole printer.
         assert screen.count("delta radius [mm]") == 1 and "tower angle C" not in screen
@@ -259,3 +259,17 @@ def _true_place(carriages: Array, parameters: dict[str, dict[str, float]]) -> Ar
         slope = 2 * np.concatenate([across, up[..., None]], -1)
         place = place - np.linalg.solve(slope, left[..., None])[..., 0]
     return place
+
+
+def test_the_screen_has_the_terms_of_the_telescope_that_is_shipped(tmp_path: Path, cli: Cli) -> None:
+    """Its true terms are those of experiments/data/README.md."""
+    data = Path(__file__).parents[2] / "experiments" / "data"
+    words = (f"records={data / 'telescope.csv'}", f"mechanism={data / 'telescope.yaml'}", "save_report=false")
+    code, screen, said = cli("identify", *words, "--out", tmp_path / "found")
+    assert code == 0 and "all 6 values are determined" in screen, said
+    lines = dict(line.strip().rsplit(": ", 1) for line in screen.splitlines() if " ± " in line)
+    truth = {"IA": 412.0, "IE": -85.0, "CA": 34.0, "NPAE": -27.0, "AN": 61.0, "AW": -48.0}
+    assert {name.split(" ")[-1] for name in lines} == set(truth) and "┃" not in screen
+    for name, line in lines.items():
+        value, half = (float(part.split(" ")[0]) for part in line.split(" ± "))
+        assert abs(value - truth[name.split(" ")[-1]]) < 2 * half

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 
-from ccnn_torch.mechanisms import SerialArm, as_measured, fit_frames, sees_directions
+from ccnn_torch.mechanisms import SerialArm, as_measured, fit_frames, load_mechanism, sees_directions
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
+DATA = Path(__file__).parents[2] / "experiments" / "data"
 RIGHT = 1.5707963267948966
 
 
@@ -51,3 +54,10 @@ def test_the_base_of_directions_is_turned_and_not_shifted_whatever_one_row_says(
     seen[7] = -seen[7]
     values = fit_frames(arm, q, seen)
     torch.testing.assert_close(values[:6], torch.cat([torch.zeros(3, dtype=torch.float64), turn]), atol=1e-9, rtol=0)
+
+
+def test_a_mount_whose_numbers_are_of_a_point_is_seen_as_a_point() -> None:
+    """CA of the alt-azimuth mount shifts its point, which the turns of a direction do not show."""
+    mount = load_mechanism(str(DATA / "telescope.yaml"))
+    sight = mount.forward_kinematics(torch.tensor([[0.5, 0.8], [1.0, 0.4]], dtype=torch.float64))
+    assert as_measured(mount, mount.pose, "rows", sight) is mount

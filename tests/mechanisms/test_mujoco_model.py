@@ -184,3 +184,10 @@ def test_without_mujoco_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(InputError, match=r"pip install 'ccnn-torch\[mujoco\]'"):
         mujoco_simulator(MODEL, SERVOS, "tool")
+
+
+def test_it_runs_where_the_system_does_not_tell_the_cores(arm: BlackBox, monkeypatch: pytest.MonkeyPatch) -> None:
+    joints = arm.sample_joints(2, torch.Generator().manual_seed(0))
+    monkeypatch.delattr("os.sched_getaffinity", raising=False)
+    other = load_mechanism(f"{EXAMPLES / 'mujoco_arm.py'}:ARM")
+    assert torch.equal(other.forward_kinematics(joints), arm.forward_kinematics(joints))

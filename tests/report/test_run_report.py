@@ -117,6 +117,10 @@ def test_a_network_that_makes_it_worse_is_said_with_the_remedy(results: RunResul
     screen = io.StringIO()
     run_page(results).show(Console(file=screen, width=500))
     assert told in screen.getvalue()
+    # What the model itself leaves of the rows is no more than what the parts leave: the file's commands are the cause.
+    position.explained = RmsMax(rms=alike, max=alike)
+    assert "the model is right, but its file holds commands back" in worse_text(results)
+    position.explained = None
     results.best_method = "constant"
     assert "methods=constant" not in worse_text(results)
     position.geometry = position.effects = None

@@ -96,7 +96,7 @@ def test_noise_that_was_estimated_is_no_floor() -> None:
     assert gap_table(results, About()).columns[3] == "noise floor"
     results["noise"] = "estimated"
     assert gap_table(results, About()).columns[3] == "noise, estimated"
-    unknown = "The gap of 420 µm is 20 times what the best explanation leaves; how much of what is left is noise is"
+    unknown = "The gap is 420 µm; the best explanation leaves 21.0 µm, and how much of that is noise is not known."
     assert verdict_text(results).startswith(unknown)
     assert "93 % of its mean square" in verdict_text(results)
     # What is left of a motion is 1.1 steps of the encoder, or 4.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch.diagnosis.page.data import NEXT, About
@@ -28,10 +28,10 @@ from ccnn_torch.diagnosis.verdict.text import (
     undetermined,
     words_for,
 )
-from ccnn_torch.display import display_unit, number_text, own_unit, unit_text
+from ccnn_torch.display import number_text, to_enter, unit_text
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
-from ccnn_torch.report.page import Answer
+from ccnn_torch.report.page import Answer, Card
 from ccnn_torch.report.table import Table
 
 Block = Mapping[str, Any]
@@ -40,28 +40,62 @@ ON_SCREEN, ON_PAGE = 6, 16
 
 
 def first_screen(results: Block, about: About, most: int = ON_PAGE) -> list[Answer]:
-    """The answers in reading order.
+    """The answers in reading order: what is wrong, what that removes and what to enter, then the rest.
 
     Args:
         results: as in `diagnosis.json`.
         about: with the folder and the command of a compensator, where they are known.
-        most: about so many numbers to enter are given.
+        most: about so many numbers to enter are in the table; the lines have three.
     """
-    said = [Answer("What is wrong", _wrong(results))]
-    if where := where_words(results, about):
-        said.append(Answer("Where", f"{capital('; '.join(where))}."))
-    said.append(Answer("How sure", _sure(results), table=joints_table(results)))
+    said = [Answer("What is wrong", _wrong(results)), Answer("How sure", _sure(results), table=joints_table(results))]
     if removed := _removed(results):
         said.append(Answer("What it removes", removed))
-    if look := " ".join(f.look for f in findings(results)):
-        said.append(Answer("Look at", look, table=numbers_table(results, most)))
-    if results.get("frames"):
-        said.append(Answer("Fitted frames", _frames(results["frames"])))
+    if (table := numbers_table(results, most)) is not None:
+        said.append(_enter(results, table, about))
     if about.compensate:
         said.append(Answer("Compensate", about.compensate[0], tuple(about.compensate[1:])))
+    if where := where_words(results, about):
+        said.append(Answer("Where", f"{capital('; '.join(where))}."))
+    if look := " ".join(f.look for f in findings(results)):
+        said.append(Answer("Look at", look))
+    if results.get("frames"):
+        said.append(Answer("Fitted frames", _frames(results["frames"])))
     if measure := _measure(results, about):
         said.append(Answer("Measure next", measure))
     return said
+
+
+def cards(results: Block) -> list[Card]:
+    """A card for each finding, with the clearest numbers of it; none where nothing is wrong."""
+    found, verdict = [], results["verdict"]
+    for finding in findings(results):
+        rows = _number_rows(results, finding.effect, _ON_A_CARD)[0]
+        lines = tuple(_line(row) for row in rows)
+        found.append(Card(capital(words_of(finding.effect).short), f"{capital(finding.text)}.", lines, finding.look))
+    if verdict["outside_library"] and not verdict["none"]:
+        text = f"A rest that {follows_words(verdict)}, which {no_effect_words(results)} describes."
+        found.append(Card("What is left", text))
+    return found
+
+
+def _enter(results: Block, table: Table, about: About) -> Answer:
+    """The clearest numbers, a line each; the table has more of them."""
+    known = [_number_rows(results, effect, _ON_LINES) for effect in results["verdict"]["effects"]]
+    rows, count = [row for own, *_ in known for row in own], sum(len(own) + more for own, _, more in known)
+    enters = [row for row in rows if row[3] != "–"]
+    shown, kept = enters or rows, f"{about.folder}/" if about.folder else ""
+    if len(shown) > ON_SCREEN:
+        shown = shown[:_ON_LINES]
+        text = f"{len(shown)} of {count} numbers, ± at 95 %; only all together repair the model: {kept}report.html."
+    else:
+        more = f"{count - len(shown)} more are in {kept}report.html" if count > len(shown) else "if nothing else acts"
+        text = f"all of these together, ± at 95 %; {more}." if len(shown) > 1 else f"± at 95 %; {more}."
+    return Answer("Enter instead" if enters else "Numbers found", text, tuple(_line(row) for row in shown), table)
+
+
+def _line(row: Sequence[str]) -> str:
+    name, value, interval, enter = row
+    return f"{name}: {value} {interval}" if enter == "–" else f"{name}: {enter} (off by {value} {interval})"
 
 
 def _wrong(results: Block) -> str:
@@ -84,9 +118,10 @@ def _wrong(results: Block) -> str:
 
 def _sure(results: Block) -> str:
     verdict = results["verdict"]
-    text = (
-        f"Probability {probability_words(verdict['probability'])}{f' {LEAST}' * (len(results.get('joints', ())) > 1)}"
-    )
+    least = f" {LEAST}" * (len(results.get("joints", ())) > 1)
+    what = "that nothing acts" if verdict["none"] else "that these causes, and no others, act"
+    what = what if verdict["effects"] or verdict["none"] else "that no effect of the library is the cause"
+    text = f"Probability {probability_words(verdict['probability'])}{least} {what}"
     if in_doubt(results):
         text += "; the noise is not known, and what is taken for it may hold another cause"
     return f"{text}."
@@ -248,8 +283,8 @@ def _regime(results: Block, about: About) -> str:
 _Z95 = 1.96
 # Of the middle from which a gain counts: a gain of some thousandths times the rest is no error.
 _MIDDLE_DIGITS = 6
-# Numbers of an effect, however many effects there are.
-_FEWEST = 2
+# Numbers of an effect, however many effects there are; lines of the first screen; and numbers of a card.
+_FEWEST, _ON_LINES, _ON_A_CARD = 2, 3, 4
 # A wave of forty periods over the travel, ten travels from where the joint counts from, is in step to a thousandth.
 _PERIOD_DIGITS = 7
 _OWN_UNIT = "A number without unit has that of the simulator."
@@ -263,28 +298,15 @@ def numbers_table(results: Block, most: int) -> Table | None:
         most: about so many are shown, of each effect those that are largest against their standard deviations.
     """
     rows, notes, left_out = [], [], 0
-    by_name, chosen = {e["name"]: e for e in results["effects"]}, results["verdict"]["effects"]
+    chosen = results["verdict"]["effects"]
     for effect in chosen:
-        parameters = by_name.get(effect, {}).get("parameters", {})
-        clear = clear_parameters(parameters)
-        needed = max((block.get("together", 1) for block in clear.values()), default=0)
-        repairs = needed <= min(ON_PAGE, len(clear))
-        each = max(most // max(len(chosen), 1), _FEWEST, needed if repairs else 0)
-        notes += [] if repairs else ["What is shown does not repair the model: enter all numbers together."]
-        for name in list(clear)[:each]:
-            block = parameters[name]
-            value, error = block["value"], _Z95 * block["sd"]
-            part = block.get("part") or ""
-            enter = "–" if block.get("nominal") is None or not repairs else _whole(block, block["nominal"] + value)
-            text = f"{block.get('word') or _named(name, part)}{_often(name, parameters)}{_counted(block)}"
-            text = text if len(chosen) == 1 else f"{words_of(effect).short}, {text}"
-            rows.append((text, told_words(block, value, 4), f"± {told_words(block, error, 2, value)}", enter))
-        left_out += max(len(clear) - each, 0)
-        notes += [_OWN_UNIT] if any(not block["unit"] for block in clear.values()) else []
-        notes += [words_of(effect).meaning] if clear and words_of(effect).meaning else []
+        own, remarks, more = _number_rows(results, effect, most // max(len(chosen), 1))
+        rows += own if len(chosen) == 1 else [(f"{words_of(effect).short}, {row[0]}", *row[1:]) for row in own]
+        notes += remarks
+        left_out += more
     if not rows:
         return None
-    columns: tuple[str, ...] = ("number", "error found", "95 %", "enter instead")
+    columns: tuple[str, ...] = ("number", "error found", "± (95 %)", "enter instead")
     cells: list[tuple[str, ...]] = [*rows]
     if all(row[3] == "–" for row in rows):
         columns, cells = columns[:3], [row[:3] for row in rows]
@@ -292,6 +314,30 @@ def numbers_table(results: Block, most: int) -> Table | None:
         notes.append(f"{left_out} more that are clearly not 0 are in diagnosis.json.")
     notes.append("The intervals hold if nothing else acts and the rest of the model is right.")
     return Table("Numbers to enter", columns, cells, " ".join(notes))
+
+
+def _number_rows(results: Block, effect: str, most: int) -> tuple[list[tuple[str, str, str, str]], list[str], int]:
+    """Of one effect its clearest numbers (name, error, half its interval, what to enter), notes, and how many are left.
+
+    Those that have to be entered together are all there, where these are not too many.
+    """
+    parameters = {e["name"]: e for e in results["effects"]}.get(effect, {}).get("parameters", {})
+    clear = clear_parameters(parameters)
+    needed = max((block.get("together", 1) for block in clear.values()), default=0)
+    repairs = needed <= min(ON_PAGE, len(clear))
+    each = max(most, _FEWEST, needed if repairs else 0)
+    notes = [] if repairs else ["What is shown does not repair the model: enter all numbers together."]
+    rows = []
+    for name in list(clear)[:each]:
+        block = parameters[name]
+        value, error = block["value"], _Z95 * block["sd"]
+        part = block.get("part") or ""
+        enter = "–" if block.get("nominal") is None or not repairs else to_enter(block, block["nominal"] + value)
+        text = f"{block.get('word') or _named(name, part)}{_often(name, parameters)}{_counted(block)}"
+        rows.append((text, told_words(block, value, 4), f"± {told_words(block, error, 2, value)}", enter))
+    notes += [_OWN_UNIT] if any(not block["unit"] for block in clear.values()) else []
+    notes += [words_of(effect).meaning] if clear and words_of(effect).meaning else []
+    return rows, notes, max(len(clear) - each, 0)
 
 
 def joints_table(results: Block) -> Table | None:
@@ -345,21 +391,3 @@ def _counted(block: Block) -> str:
     about = block["about"]
     scale, unit = (1e-3, "mm") if about["unit"] == "m" else (1.0, unit_text(about["unit"]))
     return f", about {about['joint']} = {number_text(about['value'] / scale, _MIDDLE_DIGITS)} {unit}"
-
-
-def _whole(block: Block, value: float) -> str:
-    """A number to enter, to the digits that are known: in its own unit, else lengths in mm, angles in rad and °."""
-    unit, sd = block["unit"], block["sd"]
-    if own := own_unit(block):
-        return f"{value / own[0]:.{_decimals(sd / own[0])}f} {own[1]}"
-    if unit == "m":
-        scale, shown = display_unit("m", 1.0)
-        return f"{value / scale:.{_decimals(sd / scale)}f} {shown}"
-    text = f"{value:.{_decimals(sd)}f} {unit_text(unit)}".removesuffix(" 1").strip()
-    degrees = math.degrees(1.0)
-    return f"{text} = {value * degrees:.{_decimals(sd * degrees)}f}°" if unit == "rad" else text
-
-
-def _decimals(sd: float) -> int:
-    """Decimals down to a tenth of a standard deviation."""
-    return min(max(1 - math.floor(math.log10(sd)), 0), 12) if sd > 0 else 6

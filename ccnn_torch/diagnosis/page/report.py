@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from ccnn_torch.diagnosis.page.data import (
     signatures_of,
     used_rows,
 )
-from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, ON_SCREEN, first_screen
+from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, ON_SCREEN, cards, first_screen
 from ccnn_torch.diagnosis.page.tables import (
     aside_table,
     confusable_table,
@@ -39,7 +40,7 @@ from ccnn_torch.diagnosis.page.tables import (
     unseen_table,
     where_table,
 )
-from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, size_text, unseen_text, verdict_text
+from ccnn_torch.diagnosis.verdict.text import aside_text, listed, network_text, size_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.arrays import load_tensors, save_tensors
@@ -54,6 +55,8 @@ Block = Mapping[str, Any]
 Arrays = Mapping[str, NDArray[np.float64]]
 _MARKDOWN = "diagnosis.md"
 _FILES = (RESULT, _MARKDOWN, NEXT, *CORRECTED, ARRAYS, LABELS)
+# Rows set aside that a terminal lists.
+_NAMED = 5
 # On a terminal only what may matter; the page and the Markdown list every candidate.
 _LEAST = 0.01
 
@@ -114,28 +117,39 @@ def diagnosis_page(
         about: for names, units and paths.
         arrays: as `write_diagnosis_report` takes them.
         figures: of the page.
-        screen: for a terminal: fewer rows, the rows set aside in a sentence, and without the verdict, which is shown
-            before all else.
+        screen: for a terminal: fewer rows, doubts and rows set aside in sentences, and without the verdict.
     """
     about, arrays = about or About(), arrays or {}
     named = {figure.name: figure for figure in figures}
     machine = [named["machine"]] if "machine" in named else []
     answers = first_screen(results, about, ON_SCREEN if screen else ON_PAGE)
+    found = cards(results) if figures else []
+    # Cards have what is wrong and what to look at, tables what the lines have.
+    plain = [a if a.table is None else a._replace(commands=()) for a in answers]
+    beside = [a for a in plain if a.label not in ("What is wrong", "Look at")] if found else answers
     aside = results["rows_set_aside"]
     why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
+    left_out = aside_text(aside, why, about.lines)
+    if len(aside) > _NAMED:
+        counted = listed([f"{number} {reason}" for reason, number in Counter(why).items()])
+        left_out = f"{len(aside)} rows set aside: {counted}; the report lists them."
+    doubts = [f"But {caution}." for caution in results.get("cautions", ())]
     return Page(
         name=about.name,
         kind="diagnosis of the gap",
         verdict="" if screen else verdict_text(results),
-        sections=[Section(figures=machine, answers=answers), *_sections(results, arrays, about, named, screen)],
+        sections=[
+            Section("What is wrong" if found else "", figures=machine, answers=beside, cards=found),
+            *_sections(results, arrays, about, named, screen),
+        ],
         facts=_facts(results, arrays, about),
-        cautions=[*filter(None, [aside_text(aside, why, about.lines)])] if screen else [],
+        cautions=[*doubts, *filter(None, [left_out])] if screen else [],
         notes=_notes(results, about),
     )
 
 
 def print_diagnosis(
-    results: Block, console: Console, about: About | None = None, *, verdict: bool = True, details: bool = False
+    results: Block, console: Console, about: About | None = None, *, begun: bool = False, details: bool = False
 ) -> None:
     """Show on a terminal what a technician needs first.
 
@@ -143,18 +157,17 @@ def print_diagnosis(
         results: as in `diagnosis.json`.
         console: where.
         about: for names, units and paths.
-        verdict: begin with the verdict; False where it was shown before.
-        details: show the tables as well.
+        begun: what is wrong was shown before.
+        details: show the verdict in two sentences, notes and tables as well, before it.
     """
-    if verdict:
-        print_text(verdict_text(results), console, "bold")
     page = diagnosis_page(results, about, screen=True)
     if details:
-        page.show(console)
-        return
-    replace(page, sections=page.sections[:1]).show(console)
-    said = "All tables are in report.html, diagnosis.md and diagnosis.json; --details shows them here."
-    print_text(said, console, "dim")
+        print_text(verdict_text(results), console)
+    else:
+        first, *rest = page.sections
+        answers = [a for a in first.answers[begun:] if a.label != "Fitted frames"]
+        page = replace(page, sections=[replace(first, answers=answers), *rest])
+    page.show(console, details)
 
 
 def _notes(results: Block, about: About) -> list[str]:
@@ -234,7 +247,7 @@ def check_text(check: Check) -> list[str]:
     units = {name: {"unit": "rad" if name.startswith("r") else "m"} for name in check.noise}
     noise = ", ".join(f"{name} {size_text(size, units[name], 2)}" for name, size in check.noise.items())
     lines = [
-        f"{check.rows} rows, {len(check.aside)} of them set aside; Jacobian's condition number up to "
+        f"{check.rows} rows, {len(check.aside)} of them set aside; condition number of the Jacobian up to "
         f"{check.condition:.3g}.",
         f"Noise, {'as given' if check.noise_given else 'estimated'}: {noise}.",
         f"Covariates: {', '.join(check.covariates) or 'none'}.",
@@ -242,8 +255,16 @@ def check_text(check: Check) -> list[str]:
     lines += [aside_text(check.aside, check.why_aside, check.lines_aside)] if check.aside else []
     lines += [f"{remark}." for remark in check.remarks]
     lines += [f"Caution: {caution}." for caution in check.cautions]
-    lines += [f"{name} cannot be seen without {why}." for name, why in check.missing.items()]
-    lines += [f"{name} could hide: its plausible size is {size:.2g} of the noise." for name, size in check.weak.items()]
+    reasons: dict[str, list[str]] = {}
+    for name, why in check.missing.items():
+        reasons.setdefault(why, []).append(name)
+    lines += [f"{unseen_text(listed(names), why)}." for why, names in reasons.items()]
+    if check.weak:
+        sizes = [f"{name} ({size:.2g} of it)" for name, size in check.weak.items()]
+        lines.append(f"{listed(sizes)} could hide in the noise: that large each plausibly is.")
+    if check.confusable:
+        alike = len({first for first, _, _ in check.confusable})
+        lines.append(f"{alike} effects do nearly what others can do on these rows; --details lists them.")
     return lines
 
 
@@ -257,7 +278,9 @@ def check_table(check: Check) -> Table:
         for name, others in found.items()
     )
     note = (
-        "Cosine between what an effect is likely to do and what another can do. A diagnosis still distinguishes them "
-        "where the other one needs implausible or more coefficients; all pairs are in check.json (--out)."
+        "1.000: on these rows the other does all that the effect does (cosine of the two). A diagnosis still tells "
+        "them apart where the other needs implausible or more numbers; all pairs are in check.json (--out)."
     )
-    return Table("Confusable", ("effect", "taken over by"), rows, note, ("taken over by",))
+    return Table(
+        "Effects that look alike on these rows", ("effect", "can be taken for"), rows, note, ("can be taken for",)
+    )

@@ -118,10 +118,9 @@ def gap_words(results: Block) -> str:
         return f"The gap is {gaps}; how large the noise is, is not known."
     many = " and ".join(times)
     if results.get("noise", "given") == "estimated":
-        left = f"the gap of {gaps} is {many} times what the best explanation leaves"
-        doubt = in_doubt(results)
-        known = "; how much of what is left is noise is not known" if doubt else ""
-        return f"{capital(left)}{known}."
+        left = " and ".join(size_text(block["noise_floor"], block) for block in blocks)
+        known = ", and how much of that is noise is not known" if in_doubt(results) else ""
+        return f"The gap is {gaps}; the best explanation leaves {left}{known}."
     return f"The gap of {gaps} is {many} times the noise{_NOISE_FROM.get(results.get('noise', 'given'), '')}."
 
 
@@ -315,10 +314,8 @@ def _removed(results: Block, joint: str) -> str:
     before, after = (size_text(blocks[0][key], blocks[0]) for key in ("before", "after"))
     if results.get("noise", "given") == "estimated":
         whole = 1 - (blocks[0]["after"] / blocks[0]["before"]) ** 2
-        return (
-            f"{joint}{100 * max(whole, 0.0):.0f} % of its mean square on data not used for fitting "
-            f"({before} → {after}), or {text.removeprefix(joint)} of it if all that is left is noise"
-        )
+        share = f"{joint}{100 * max(whole, 0.0):.0f} %"
+        return f"{share} of its mean square on data not used for fitting ({before} → {after})"
     return f"{text} of what is above the noise on data not used for fitting ({before} → {after})"
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
+from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
 
 Progress = Callable[[float], None]
@@ -70,10 +71,10 @@ def check_equations(problem: Problem) -> None:
     channels, k = len(problem.channels), len(problem.parameters)
     held = int(torch.isfinite(problem.prior_sd).sum())
     if equations + held < k:
-        needed = -(-(k - held) // channels)
+        needed, priors = -(-(k - held) // channels), f" and {held} priors" if held else ""
         raise InputError(
-            f"{rows} rows of {channels} equations{f' and {held} priors' if held else ''} cannot determine {k} free "
-            f"parameters; measure at least {needed} poses, or fix parameters"
+            f"{rows} rows of {count_text(channels, 'equation')}{priors} cannot determine {k} free parameters; "
+            f"measure at least {needed} rows, or fix parameters"
         )
 
 
@@ -134,7 +135,7 @@ def joined(parts: Sequence[Problem], shared: int) -> Problem:
 
 @dataclass(frozen=True)
 class Fit:
-    """What a solver found.
+    """The result of a solver: values, residuals, whether it converged.
 
     Attributes:
         values: `r x k` [SI].
@@ -157,7 +158,7 @@ def part_of(progress: Progress | None, number: int, count: int) -> Progress | No
 
 
 class Solver(Protocol):
-    """A way to minimise a problem; all its randomness comes from the seed."""
+    """Protocol of a solver: it minimises a problem; all its randomness comes from the seed."""
 
     def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
         """Minimise half the weighted sum of squared residuals and prior terms of every machine."""

@@ -15,7 +15,7 @@ _TRIED, _LEAST = 200, 1e-10
 
 @dataclass(frozen=True)
 class LCurve:
-    """Of `r` machines and `w` weights.
+    """Residual against size of the change, of `r` machines and `w` regularisation weights.
 
     Attributes:
         weight: α, falling, `r x w` [1].

@@ -233,6 +233,8 @@ def as_measured(
     """The mechanism as records with these pose coordinates show it: itself, an arm by positions alone or by directions,
     or `Partial`.
 
+    A machine whose file says that its pose is a position stays what it is.
+
     Args:
         where: the file, which opens the sentence.
         measured: their poses, `s x p` [SI]: positions that are all as far from the origin are directions.
@@ -241,7 +243,7 @@ def as_measured(
         InputError: frames would have to be fitted to rows that show too little of them.
     """
     names, whole = [c.name for c in pose], [c.name for c in mechanism.pose]
-    if isinstance(mechanism, SerialArm) and names == ["x", "y", "z"] and _are_directions(measured):
+    if isinstance(mechanism, SerialArm) and names == ["x", "y", "z"] != whole and _are_directions(measured):
         looking = mechanism.with_orientation("direction")
         if bool(looking.revolute.all()) and "tool" not in looking.unknown_frames:
             return looking

@@ -1,4 +1,4 @@
-"""Parallel machines with legs on guideways: the tripod and the machine tool of paper 000."""
+"""Parallel machines with legs on guideways: the tripod and the machine tool of the paper."""
 
 from __future__ import annotations
 

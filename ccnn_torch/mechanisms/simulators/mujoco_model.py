@@ -296,7 +296,9 @@ class MujocoMachine:
         self.gear = self.model.actuator_gear[self.actuators, 0]
         self.extra = np.arange(self.model.nu - len(self.loads), self.model.nu)
         self.home = np.array(self.model.key_qpos[0] if self.model.nkey else self.model.qpos0)
-        count = threads or len(os.sched_getaffinity(0))
+        # Windows and macOS do not tell which cores a process may use.
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        count = threads or cores
         self.data = [self.mujoco.MjData(self.model) for _ in range(count)]
         self.width = self.mujoco.mjtState.mjSTATE_FULLPHYSICS
 

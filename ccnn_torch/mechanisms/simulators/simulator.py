@@ -216,7 +216,7 @@ _WATCHER: ContextVar[Callable[[int], None] | None] = ContextVar("watcher", defau
 
 @contextmanager
 def simulated_rows(tell: Callable[[int], None]) -> Iterator[None]:
-    """Within it, `tell` is called with the number of rows a slow simulator (one with a cache) has simulated so far."""
+    """Context in which `tell` receives the number of rows that a slow simulator has simulated so far."""
     count = 0
 
     def more(rows: int) -> None:

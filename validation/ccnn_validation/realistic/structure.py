@@ -216,7 +216,7 @@ def _unit(vector: Tensor) -> Tensor:
 
 
 def tripod_structure() -> LegStructure:
-    """The tripod of paper 000, case one: guideways along +x, -x and +y through the origin."""
+    """The tripod of the paper, case one: guideways along +x, -x and +y through the origin."""
     mechanism = Tripod()
     length, radius = mechanism.nominal.tolist()
     out = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
@@ -235,7 +235,7 @@ def tripod_structure() -> LegStructure:
 
 
 def machine_tool_structure() -> LegStructure:
-    """The parallel machine tool of paper 000, case two."""
+    """The parallel machine tool of the paper, case two."""
     mechanism = MachineTool()
     l_e, l_b, z_0, length, gamma = mechanism.nominal[:5].tolist()
     alpha, beta = mechanism.nominal[5:8], mechanism.nominal[8:11]

@@ -1,0 +1,102 @@
+"""`ccnn start`: the usual way from a file of measurements to a verified model, one command after another."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ccnn_torch.cli.from_records import check, diagnose, new, run
+from ccnn_torch.cli.options import Mechanism, Overrides, Quiet
+from ccnn_torch.cli.with_model import verify
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import make_folder
+from ccnn_torch.files.yaml_file import read_yaml
+
+_STEPS = 5
+
+
+def start(
+    records: Annotated[Path | None, typer.Argument(metavar="RECORDS.csv", help="Measured rows, with headers.")] = None,
+    overrides: Overrides = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of all steps; runs/RECORDS without it.")] = None,
+    mechanism: Mechanism = None,
+    units: Annotated[
+        str | None, typer.Option(metavar="LENGTH,ANGLE", help="Units of columns without one, e.g. mm,deg.")
+    ] = None,
+    new_rows: Annotated[
+        str | None, typer.Option("--new", metavar="NEW.csv", help="Rows measured since, which judge the model.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Go on at every gate.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Go from measured rows to a verified model, step by step: new, check, diagnose, run, verify.
+
+    Before each step it says what comes, and on a terminal asks whether to go on. It trains no model where the diagnosis
+    finds nothing beyond the noise, but with --yes. What is finished is not done again: ccnn start --out DIR goes on
+    where it was stopped. key=value is for ccnn run. Exit codes are those of the commands.
+
+    Examples:
+
+    ccnn start measured.csv
+
+    ccnn start measured.csv --mechanism my_arm.yaml --units mm,deg --out runs/arm --yes
+
+    ccnn start --out runs/arm --new next_week.csv
+    """
+    if records is not None and "=" in str(records) and not records.is_file():
+        records, overrides = None, [str(records), *(overrides or [])]
+    if out is None:
+        if records is None:
+            raise InputError("name RECORDS.csv to begin, or --out DIR to go on")
+        out = Path("runs") / records.stem
+    asks = not yes and not quiet and sys.stdin is not None and sys.stdin.isatty()
+    config, diagnosis, folder = out / "robot.yaml", out / "diagnosis", out / "run"
+
+    def due(step: int, result: Path, what: str, wanted: bool = True) -> bool:
+        """Whether a step is still to be done; leaves the command where the user, or a gate, does not want it."""
+        if result.is_file():
+            if not quiet:
+                typer.echo(f"{step} of {_STEPS}: done before, {result}")
+            return False
+        if not quiet:
+            typer.echo(f"{step} of {_STEPS}: {what}")
+        if not (typer.confirm("Go on?", default=wanted) if asks else yes or wanted):
+            typer.echo(f"Stopped here; ccnn start --out {out} goes on{'' if asks else ', with --yes'}.")
+            raise typer.Exit
+        return True
+
+    if due(1, config, "write a config for the records (ccnn new)"):
+        if records is None:
+            raise InputError(f"{config} is not there yet; name RECORDS.csv to begin")
+        make_folder(out)
+        new(records, config, mechanism, units, quiet=quiet)
+        if "mechanism" not in read_yaml(config):
+            config.unlink()
+            raise InputError(
+                f"--mechanism: no built-in machine is the only one with the columns of {records}; give its name or file"
+            )
+    if due(2, out / "check.json", "see what these rows can show (ccnn check)"):
+        check(config=config, out=str(out), quiet=quiet)
+    if due(3, diagnosis / "report.html", "find the cause of the error (ccnn diagnose)"):
+        diagnose(config=config, out=str(diagnosis), quiet=quiet)
+    from ccnn_torch.report.json_files import read_json
+
+    verdict = read_json(diagnosis / "diagnosis.json")["verdict"]
+    what = "nothing beyond the noise was found, so a model would learn noise" if verdict["none"] else "train a model"
+    if due(4, folder / "results.json", f"{what} (ccnn run)", wanted=not verdict["none"]):
+        if (folder / "config.yaml").is_file():
+            run(resume=folder, quiet=quiet)
+        else:
+            run(config, overrides, out=str(folder), quiet=quiet)
+    if new_rows is None and asks:
+        new_rows = typer.prompt("File of rows measured since, which judge the model (empty: later)", default="") or None
+    if new_rows is None:
+        if not quiet:
+            typer.echo(f"5 of {_STEPS}: measure 20 poses or more again, then: ccnn start --out {out} --new NEW.csv")
+        return
+    if not quiet:
+        typer.echo(f"5 of {_STEPS}: judge the model on {new_rows} (ccnn verify)")
+    verify(folder / "model.safetensors", out / "verified", new_rows, quiet=quiet)
