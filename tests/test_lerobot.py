@@ -14,6 +14,7 @@ import pytest
 from logged_arm import BACKLASH, DELAY, JOINTS, LAG, run
 from numpy.typing import NDArray
 
+from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion import load_logs
 from ccnn_torch.motion.log import Log
@@ -221,3 +222,11 @@ def test_a_folder_that_is_nothing_is_refused(tmp_path: Path) -> None:
 def test_the_shipped_data_set_is_read() -> None:
     logs = load_logs([Path(__file__).parent.parent / "experiments" / "data" / "lerobot_arm"], keys={"units": "deg"})
     assert [len(log.time) for log in logs] == [300] * 4
+
+
+def test_paths_of_logs_in_a_config_start_from_its_folder(tmp_path: Path) -> None:
+    config = tmp_path / "arm.yaml"
+    config.write_text("motion: [set, more.csv]\nmotion_keys: {calibration: arm.json, episodes: 3}\nmechanism: servo\n")
+    given = DiagnoseConfig.from_file(config)
+    assert given.motion == [str(tmp_path / "set"), str(tmp_path / "more.csv")]
+    assert given.motion_keys == {"calibration": str(tmp_path / "arm.json"), "episodes": 3}
