@@ -111,6 +111,13 @@ def test_g_code_reaches_its_positions_and_keeps_every_other_byte(tmp_path: Path,
         bare = re.sub(r"[-+]?\d[\d.]*", "#", re.sub(r"(?<=\d) [XYZ][-\d.]+(?=[ \r])(?=.*\r)", "", after))
         same = re.sub(r"[-+]?\d[\d.]*", "#", re.sub(r"(?<=\d) [XYZ][-\d.]+(?=[ \r])(?=.*\r)", "", before))
         assert bare == same
+    # What a machine does not turn stays as it is written.
+    (tmp_path / "part.src").write_text("LIN {X 400,Y 300.0,Z 100,A 10,B 20.5,C -30}\n")
+    assert cli("compensate", model, tmp_path / "part.src", tmp_path / "out.src")[0] == 0
+    frame = r"LIN \{X ([\d.]+),Y ([\d.]+),Z ([\d.]+),A 10,B 20\.5,C -30\}\n"
+    place = re.fullmatch(frame, (tmp_path / "out.src").read_text())
+    assert place
+    np.testing.assert_allclose(gantry_goes(*map(float, place.groups())), [400, 300, 100], atol=2e-4)
     for kept in (
         "(M\xfcnster, part 7) G21",
         "F3000 ; not G1 X999\r\n",
