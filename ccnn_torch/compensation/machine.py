@@ -111,7 +111,7 @@ class Machine(nn.Module):
 
     def aim_back(self, moved: Tensor, covariates: Tensor) -> Tensor:
         """The same for the way back: the pose that the machine has; moved: command and what was learned there."""
-        return self._aim(self._reached(moved, covariates), self._nominal.at(moved), _BACK)
+        return self._aim(self.reached(moved, covariates), self._nominal.at(moved), _BACK)
 
     def next_correction(
         self, moved: Tensor, covariates: Tensor, ideal: Tensor, correction: Tensor, aim: Tensor
@@ -125,7 +125,7 @@ class Machine(nn.Module):
             correction: ideal joints less command, `... x n` [SI].
             aim: of the ideal joints.
         """
-        return self._step(self._reached(moved, covariates), correction, aim)
+        return self._step(self.reached(moved, covariates), correction, aim)
 
     def next_back(self, joints: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
         """The same for the way back: what to subtract from the command; joints: ideal ones, tried."""
@@ -167,7 +167,8 @@ class Machine(nn.Module):
         make = Links if isinstance(self.mechanism, SerialArm) else ClosedKinematics
         self._nominal, self._identified = make(self.mechanism), make(self.real)
 
-    def _reached(self, moved: Tensor, covariates: Tensor) -> Placed:
+    def reached(self, moved: Tensor, covariates: Tensor) -> Placed:
+        """Where the real machine is at command and what was learned there `... x n`, and covariates `... x m` [SI]."""
         if self.effects is None:
             return self._identified.at(moved)
         joints, shift = self.effects.changes(moved, covariates)

@@ -14,9 +14,10 @@ from machines import AROUND, SIX, known
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from stand_ins import fields
+from stand_ins import fields, tripod_compensator
 
 from ccnn_torch.compensation import save_model
+from ccnn_torch.compensation.parts import all_over, machine_alone
 from ccnn_torch.compensation.programs.gcode import GCode
 from ccnn_torch.compensation.programs.literals import Krl, Rapid
 from ccnn_torch.errors import InputError
@@ -110,6 +111,13 @@ def test_g_code_reaches_its_positions_and_keeps_every_other_byte(tmp_path: Path,
         bare = re.sub(r"[-+]?\d[\d.]*", "#", re.sub(r"(?<=\d) [XYZ][-\d.]+(?=[ \r])(?=.*\r)", "", after))
         same = re.sub(r"[-+]?\d[\d.]*", "#", re.sub(r"(?<=\d) [XYZ][-\d.]+(?=[ \r])(?=.*\r)", "", before))
         assert bare == same
+    # What a machine does not turn stays as it is written.
+    (tmp_path / "part.src").write_text("LIN {X 400,Y 300.0,Z 100,A 10,B 20.5,C -30}\n")
+    assert cli("compensate", model, tmp_path / "part.src", tmp_path / "out.src")[0] == 0
+    frame = r"LIN \{X ([\d.]+),Y ([\d.]+),Z ([\d.]+),A 10,B 20\.5,C -30\}\n"
+    place = re.fullmatch(frame, (tmp_path / "out.src").read_text())
+    assert place
+    np.testing.assert_allclose(gantry_goes(*map(float, place.groups())), [400, 300, 100], atol=2e-4)
     for kept in (
         "(M\xfcnster, part 7) G21",
         "F3000 ; not G1 X999\r\n",
@@ -133,14 +141,23 @@ def test_g_code_reaches_its_positions_and_keeps_every_other_byte(tmp_path: Path,
         ("M98 P7\n", "line 1: calls another program"),
         ("G68 X0 Y0 R30\n", "line 1: G68 is another frame of the axes"),
         ("N3 G1 X1 Y1 Z1 *57\n", "line 1: has a checksum"),
-        ("M3 S1000\n", "has no position"),
-        ("G0 X1\0", "is no text of one byte a letter"),
     ],
 )
-def test_what_straight_moves_do_not_follow_is_refused(tmp_path: Path, cli: Cli, text: str, said: str) -> None:
-    (tmp_path / "part.ngc").write_text(text)
-    code, _, err = cli("compensate", gantry(tmp_path), tmp_path / "part.ngc", tmp_path / "out.ngc")
-    assert code == 2 and said in err and err.count("\n") == 1 and not (tmp_path / "out.ngc").exists()
+def test_what_straight_moves_do_not_follow_is_refused(text: str, said: str) -> None:
+    with pytest.raises(InputError, match=re.escape(said)):
+        GCode(text, False)
+
+
+def test_nothing_is_written_of_a_program_that_is_refused(tmp_path: Path, cli: Cli) -> None:
+    model, path = gantry(tmp_path), tmp_path / "part.ngc"
+    for text, said in (
+        ("M3 S1000\n", "part.ngc: has no position"),
+        ("G0 X1\0", "part.ngc: is no text of one byte a letter"),
+        ("G3 X1 I2\n", "part.ngc: line 1: G3 is an arc"),
+    ):
+        path.write_text(text)
+        code, _, err = cli("compensate", model, path, tmp_path / "out.ngc")
+        assert code == 2 and said in err and err.count("\n") == 1 and not (tmp_path / "out.ngc").exists()
 
 
 LIMITS = [[float(m) - 0.9, float(m) + 0.9] for m in AROUND]
@@ -168,9 +185,9 @@ class Arm:
         self.nominal = SerialArm("six", "standard", SIX, limits=LIMITS, tool=FLANGE, goal_tool=FLANGE)
         draw = torch.randn(self.nominal.nominal.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
         self.real = self.nominal.with_nominal(self.nominal.nominal + 3e-4 * draw * (torch.arange(len(draw)) >= 6))
-        before = dict(zip((p.name for p in self.nominal.geometry), self.nominal.nominal.tolist(), strict=True))
-        self.model = folder / "identified.yaml"
-        self.model.write_text(mechanism_text(self.real, before))
+        made = machine_alone(all_over(self.nominal), self.real.nominal, margin=0.0)
+        about = fields() | {"mechanism": self.nominal.describe()}
+        self.model = save_model(folder, made, about, forms=("safetensors",))["safetensors"]
         self.joints = AROUND.numpy() + np.random.default_rng(3).uniform(-0.7, 0.7, (6, 6))
 
     def at(self, machine: Mechanism, joints: Array) -> Array:
@@ -194,6 +211,11 @@ class Arm:
         assert np.abs(self.at(self.real, joints) - self.at(self.nominal, joints)).max() > 1e-4
 
 
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Arm:
+    return Arm(tmp_path_factory.mktemp("arm"))
+
+
 def krl(frame: Array) -> str:
     a, b, c = Rotation.from_matrix(frame[:3, :3]).as_euler("ZYX", degrees=True)
     x, y, z = 1e3 * frame[:3, 3]
@@ -212,8 +234,7 @@ def read_krl(text: str) -> list[Array]:
     return found
 
 
-def test_krl_reaches_its_frames_and_axes(tmp_path: Path, cli: Cli) -> None:
-    arm = Arm(tmp_path)
+def test_krl_reaches_its_frames_and_axes(tmp_path: Path, cli: Cli, arm: Arm) -> None:
     frames = [arm.at(arm.nominal, q) for q in arm.joints]
     axes = ",".join(f"A{i + 1} {math.degrees(q):.6f}" for i, q in enumerate(arm.joints[3]))
     # In the form of KUKA's System Software manuals; a sample of such files is in ros-industrial/kuka_experimental.
@@ -249,8 +270,7 @@ def quaternion(frame: Array) -> Array:
     return np.array([w, x, y, z])
 
 
-def test_rapid_reaches_its_targets(tmp_path: Path, cli: Cli) -> None:
-    arm = Arm(tmp_path)
+def test_rapid_reaches_its_targets(tmp_path: Path, cli: Cli, arm: Arm) -> None:
     targets = []
     for k in (0, 1):
         frame = arm.at(arm.nominal, arm.joints[k])
@@ -287,8 +307,7 @@ def test_rapid_reaches_its_targets(tmp_path: Path, cli: Cli) -> None:
     assert found[8].endswith(",[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]],v100,z1,t1\\WObj:=w1;")
 
 
-def test_positions_outside_are_left_and_listed_and_a_frame_may_be_given(tmp_path: Path, cli: Cli) -> None:
-    arm = Arm(tmp_path)
+def test_positions_outside_are_left_and_listed_and_a_frame_may_be_given(tmp_path: Path, cli: Cli, arm: Arm) -> None:
     base = np.eye(4)
     base[:3, 3], base[:3, :3] = [0.1, -0.2, 0.05], Rotation.from_rotvec([0, 0, 0.5]).as_matrix()
     tool = np.array([0.0, 0.05, 0.2, 0.3, 0.0, 0.0])
@@ -317,7 +336,9 @@ def test_positions_outside_are_left_and_listed_and_a_frame_may_be_given(tmp_path
 def test_a_model_that_has_learned_and_one_with_covariates_correct_programs(tmp_path: Path, cli: Cli) -> None:
     about = known("arm with effects")
     made = about.compensator(1e-5)
-    model = save_model(tmp_path, made, fields() | {"mechanism": about.mechanism.describe()}, forms=("onnx",))["onnx"]
+    model = save_model(tmp_path, made, fields() | {"mechanism": about.mechanism.describe()}, forms=("safetensors",))[
+        "safetensors"
+    ]
     joints = about.joints[:4].numpy()
     text = "".join("PTP {" + ",".join(f"A{i + 1} {v:.7f}" for i, v in enumerate(np.degrees(q))) + "}\n" for q in joints)
     (tmp_path / "a.src").write_text(text)
@@ -331,8 +352,7 @@ def test_a_model_that_has_learned_and_one_with_covariates_correct_programs(tmp_p
 
 
 def test_a_program_is_for_machines_with_positions(tmp_path: Path, cli: Cli) -> None:
-    about = known("tripod")
-    model = save_model(tmp_path, about.compensator(), fields() | {"mechanism": about.mechanism.describe()}, forms=())
+    model = save_model(tmp_path, tripod_compensator(), fields(), forms=())
     (tmp_path / "a.nc").write_text("G0 X1 Y1 Z1\n")
     code, _, err = cli("compensate", model["safetensors"], tmp_path / "a.nc", tmp_path / "b.nc")
     assert code == 2 and "has no positions x, y, z" in err

@@ -142,7 +142,7 @@ def test_the_controller_writes_the_commands_of_the_model(tmp_path: Path) -> None
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     (tmp_path / "out" / "main.cpp").write_text(MAIN)
-    strict = ["-Wall", "-Wextra", "-Wshadow", "-Werror", "-O1"]
+    strict = ["-Wall", "-Wextra", "-Wshadow", "-Werror"]
     for words in (
         ["gcc", "-std=c99", *strict, "-c", "compensator.c"],
         ["g++", "-std=c++17", *strict, "-I", str(tmp_path / "ros"), "main.cpp", "compensator.o", "-lm", "-o", "one"],

@@ -94,9 +94,14 @@ class Found:
         compensator, joints = self.model.compensator, self.rows.joints
         assert compensator is not None
         centre = compensator.domain.centre[joints.shape[1] :].expand(len(joints), -1)
+        given = centre if compensator.covariates else None
         with torch.no_grad():
+            if compensator.machine is not None and isinstance(self.identified, SerialArm):
+                there = compensator.machine.reached(joints + compensator.learned(joints, given), centre)
+                turns = [] if there.rotation is None else [matrix_to_rotation_vector(there.rotation)]
+                return torch.cat([there.position, *turns], -1)
             # The ideal joints are those at which the nominal machine is where the real one is.
-            ideal = compensator.back(joints, centre if compensator.covariates else None)
+            ideal = compensator.back(joints, given)
         made_for = mechanism_from_description(self.model.facts["mechanism"], self.allow_code)
         return made_for.forward_kinematics(ideal)
 
