@@ -80,7 +80,7 @@ def number_text(value: float | None, digits: int = 4) -> str:
 
 def count_text(count: int, word: str) -> str:
     """`1 repeat`, `30 repeats`."""
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"
+    return f"{count} {word}" if count == 1 else f"{count} {word}{'es' if word.endswith('ch') else 's'}"
 
 
 def visible(text: str, longest: int = 200) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ccnn_validation import changes
 from numpy.typing import NDArray
 
 import ccnn_torch
@@ -139,3 +140,22 @@ def test_too_few_rows_are_refused(identified: Path, tmp_path: Path) -> None:
     write(tmp_path / "new.csv", drawn(60, 3), 60)
     with pytest.raises(InputError, match=r"new.csv: has 3 configurations; measure 4 or more"):
         ccnn_torch.since(identified, tmp_path / "new.csv")
+
+
+def test_the_judge_puts_changes_into_rows_and_compares_what_is_told(
+    identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "new.csv", drawn(70, 12), 70)
+    words = ["changes", str(identified), str(tmp_path / "new.csv"), "--draws", "1", "--out", str(tmp_path / "out.csv")]
+    monkeypatch.setattr("sys.argv", words)
+    changes.main()
+    lines = (tmp_path / "out.csv").read_text().splitlines()
+    kinds = [line.split(",")[0].split()[0] for line in lines[1:]]
+    assert kinds == [
+        "nothing",
+        "joint_offset",
+        "joint_gain",
+        "frame",
+        "tool",
+    ]
+    assert lines[1].startswith("nothing,nothing,yes") and "claims at 0.9" in capsys.readouterr().out
