@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -136,10 +137,13 @@ def test_the_command_and_its_files(
     assert code == 2 and "needs new rows" in err
 
 
-def test_too_few_rows_are_refused(identified: Path, tmp_path: Path) -> None:
+def test_too_few_rows_and_a_model_without_a_promise_are_refused(identified: Path, tmp_path: Path) -> None:
     write(tmp_path / "new.csv", drawn(60, 3), 60)
     with pytest.raises(InputError, match=r"new.csv: has 3 configurations; measure 4 or more"):
         ccnn_torch.since(identified, tmp_path / "new.csv")
+    shutil.copy(identified, tmp_path)
+    with pytest.raises(InputError, match="promises no error of the position"):
+        ccnn_torch.since(tmp_path / identified.name, tmp_path / "new.csv")
 
 
 def test_the_judge_puts_changes_into_rows_and_compares_what_is_told(

@@ -39,7 +39,7 @@ from ccnn_torch.evidence.beam import search
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, covariance
 from ccnn_torch.evidence.judge import Explanation, Verdict, judge, marginal, posterior
 from ccnn_torch.evidence.priors import EFFECT
-from ccnn_torch.mechanisms import Mechanism, as_measured
+from ccnn_torch.mechanisms import Mechanism, as_measured, sees_directions
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.designs import Candidates
 from ccnn_torch.records import load_records
@@ -75,9 +75,9 @@ class _Rows:
         scale: what a channel is multiplied by to be in units of the noise, a configuration counting once, `s x c`;
             0 where it was not measured.
         channels: which of the pose's channels, `c`.
-        noise_dof: weight of that noise, in values; 0 = the model promises none.
+        noise_dof: weight of that noise, in values.
         moved: how the measuring device stands elsewhere than when the model was made; no motion where it does not.
-        promise: RMS that the model promises of position [m] and rotation [rad].
+        promise: RMS that the model promises of `position` [m] and `rotation` [rad].
     """
 
     situation: Situation
@@ -87,7 +87,7 @@ class _Rows:
     channels: Tensor
     noise_dof: float
     moved: Motion
-    promise: tuple[float | None, float | None]
+    promise: Mapping[str, float]
 
     @property
     def lengths(self) -> Tensor:
@@ -190,23 +190,25 @@ def _rows_of(model: LoadedModel, machine: Mechanism, loaded: Any) -> _Rows:
     seen = measured_channels(situation, found.pose)
     known = torch.isfinite(residual) if seen is None else seen[:, channels] & torch.isfinite(residual)
     groups = configurations(joints, machine.joints)
-    promise = promise_of(model) or {}
     lengths = torch.tensor([machine.channels[int(k)].unit == "m" for k in channels])
-    rms = [None if (block := promise.get(kind)) is None else float(block["rms"]) for kind in ("position", "rotation")]
-    dof = [
-        2 * promise["configurations"] / promise[kind]["spread"]
-        for kind in ("position", "rotation")
-        if promise.get(kind)
-    ]
-    own = torch.where(known, residual, torch.nan).square().nanmean(0).sqrt()
-    sigma = torch.empty_like(own)
-    for mine, size in ((lengths, rms[0]), (~lengths, rms[1])):
-        sigma[mine] = own[mine] if size is None else size / math.sqrt(max(int(mine.sum()), 1))
+    promise, sigma = promise_of(model) or {}, residual.new_empty(len(channels))
+    kept: dict[str, float] = {}
+    for kind, mine in (("position", lengths), ("rotation", ~lengths)):
+        if not bool(mine.any()):
+            continue
+        block = promise.get(kind)
+        if block is None:
+            raise InputError(
+                f"{model.path}: promises no error of the {kind} for new rows, so nothing says what is a change; take a "
+                "model that held rows out, an identified.yaml with its identified.json beside it (not one of sockets)"
+            )
+        kept[kind] = float(block["rms"])
+        sigma[mine] = kept[kind] / math.sqrt(int(mine.sum()))
+    dof = min(2 * promise["configurations"] / promise[kind]["spread"] for kind in kept)
     share = torch.bincount(groups)[groups].to(sigma.dtype).rsqrt()
     scale = torch.where(known, share[:, None] / sigma, 0.0)
-    is_known = all(size is not None for mine, size in ((lengths, rms[0]), (~lengths, rms[1])) if bool(mine.any()))
     filled = torch.where(known, residual, 0.0)
-    return _Rows(situation, filled, groups, scale, channels, min(dof) if is_known else 0.0, moved, (rms[0], rms[1]))
+    return _Rows(situation, filled, groups, scale, channels, dof, moved, kept)
 
 
 def _moved(found: Rows) -> Motion:
@@ -264,7 +266,7 @@ def _is_more(rows: _Rows, found: FittedSet) -> bool:
     from scipy.stats import f
 
     free = max(rows.values - found.effective, 1.0)
-    return rows.noise_dof > 0 and float(f.sf(found.rss / free, free, rows.noise_dof)) < _CHANCE
+    return float(f.sf(found.rss / free, free, rows.noise_dof)) < _CHANCE
 
 
 def _words(atom: Atom) -> str:
@@ -319,8 +321,10 @@ def _gap(rows: _Rows, dictionary: Dictionary, found: FittedSet, unit: str) -> Ga
         return float(squares[known[:, mine].any(-1)].mean().sqrt())
 
     after = rms(_left_out(rows, dictionary, found)) if found.members else None
-    promised = rows.promise[0 if unit == "m" else 1]
-    return Gap(unit="m" if unit == "m" else "rad", before=rms(rows.residual), after=after, promised=promised)
+    promised = rows.promise["position" if unit == "m" else "rotation"]
+    # A direction is a vector of length 1.
+    length = unit == "m" and not sees_directions(rows.situation.mechanism)
+    return Gap(unit="m" if length else "rad", before=rms(rows.residual), after=after, promised=promised)
 
 
 def _left_out(rows: _Rows, dictionary: Dictionary, found: FittedSet) -> Tensor:
@@ -415,22 +419,23 @@ def _best(rows: _Rows, there: Situation, asked: Candidates, separates: list[str]
 
 def since_text(results: SinceResults) -> str:
     """The verdict in two or three sentences."""
-    scale, unit = display_unit("m", results.position.before)
+    scale, unit = display_unit(results.position.unit, results.position.before)
+    what = "position" if results.position.unit == "m" else "direction"
     before, after, promised = (
         None if v is None else f"{number_text(v / scale, 3)} {unit}"
         for v in (results.position.before, results.position.after, results.position.promised)
     )
     rows = count_text(results.rows, "new row")
-    limit = "" if promised is None else f", the model promises {promised}"
+    limit = f", the model promises {promised}"
     if not results.changed:
         said = "Something changed that none of the changes here explains"
         said = said if results.rest else "Nothing changed that these rows show"
-        return f"{said}: on {rows} the position is off by {before} RMS{limit} (p {results.probability:.2f})."
-    what = " and ".join(_said(one) for one in results.changed)
+        return f"{said}: on {rows} the {what} is off by {before} RMS{limit} (p {results.probability:.2f})."
+    changed = " and ".join(_said(one) for one in results.changed)
     more = " Beside this more is left than the model promises." if results.rest else ""
     return (
-        f"Changed since the model was made: {what} (p {results.probability:.2f}). "
-        f"On {rows} the position is off by {before} RMS, and by {after} with this change, each row left out in turn"
+        f"Changed since the model was made: {changed} (p {results.probability:.2f}). "
+        f"On {rows} the {what} is off by {before} RMS, and by {after} with this change, each row left out in turn"
         f"{limit}.{more}"
     )
 

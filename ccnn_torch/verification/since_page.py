@@ -54,7 +54,8 @@ def since_tables(results: SinceResults, joints: Sequence[Coordinate]) -> list[Ta
     note = " ".join(dict.fromkeys(told.look for told in results.changed))
     changed = Table("What changed?", columns, numbers, note, ("number", columns[-1])) if numbers else None
     gaps = []
-    for kind, gap in (("position", results.position), ("rotation", results.rotation)):
+    first = "position" if results.position.unit == "m" else "direction"
+    for kind, gap in ((first, results.position), ("rotation", results.rotation)):
         if gap is not None:
             scale, unit = display_unit(gap.unit, gap.before)
             cells = (number_text(None if v is None else v / scale, 3) for v in (gap.before, gap.after, gap.promised))

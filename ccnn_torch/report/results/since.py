@@ -46,7 +46,7 @@ class Gap(Result):
     before: float
     after: Number
     """each configuration left out in turn; null where nothing changed"""
-    promised: Number
+    promised: float
     """RMS of rows held out when the model was made"""
 
 
