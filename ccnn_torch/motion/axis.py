@@ -95,7 +95,7 @@ def simulate_axes(
     """
     b, s = drive.command.shape
     # Every entry has the same first dimension then, also where a single value stands for all.
-    p = max([1, *(len(v) for v in parameters.values())])
+    p = max([1 if rows is None else len(rows), *(len(v) for v in parameters.values())])
     runs = np.broadcast_to(np.arange(b), (p, b)) if rows is None else rows.numpy()
     # Where all runs have the same parameters they stand there once.
     wide = max([1, *(v.shape[-1] for v in parameters.values())])
