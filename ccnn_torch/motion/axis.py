@@ -99,7 +99,7 @@ def simulate_axes(
     runs = np.broadcast_to(np.arange(b), (p, b)) if rows is None else rows.numpy()
     # Where all runs have the same parameters they stand there once.
     wide = max([1, *(v.shape[-1] for v in parameters.values())])
-    a = {n: np.full((p, wide), v) for n, v in ABSENT.items()}
+    a = dict(zip(ABSENT, np.repeat([*ABSENT.values()], p * wide).reshape(-1, p, wide), strict=True))
     for name in a.keys() & parameters.keys():
         a[name][:] = parameters[name].numpy()
     axis, offset = Axis(*(v.ravel() for v in axis_of(a))), a["offset"].ravel()
