@@ -250,7 +250,7 @@ def from_si(values: ArrayLike, si_unit: str, unit: str) -> NDArray[np.float64]:
 
 
 # Usual units with their SI unit and pint's own factor: pint's registry takes half a second to make.
-_USUAL = {unit: (unit, 1.0) for unit in ("m", "rad", "s", "K", "N", "N*m", "1", "m/s", "rad/s")} | {
+_USUAL = {unit: (unit, 1.0) for unit in ("m", "rad", "s", "K", "N", "N*m", "1", "m/s", "rad/s", "V", "A")} | {
     "mm": ("m", 1e-3),
     "um": ("m", 1e-6),
     "deg": ("rad", math.pi / 180),

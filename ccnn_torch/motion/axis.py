@@ -95,11 +95,11 @@ def simulate_axes(
     """
     b, s = drive.command.shape
     # Every entry has the same first dimension then, also where a single value stands for all.
-    p = max([1, *(len(v) for v in parameters.values())])
+    p = max([1 if rows is None else len(rows), *(len(v) for v in parameters.values())])
     runs = np.broadcast_to(np.arange(b), (p, b)) if rows is None else rows.numpy()
     # Where all runs have the same parameters they stand there once.
     wide = max([1, *(v.shape[-1] for v in parameters.values())])
-    a = {n: np.full((p, wide), v) for n, v in ABSENT.items()}
+    a = dict(zip(ABSENT, np.repeat([*ABSENT.values()], p * wide).reshape(-1, p, wide), strict=True))
     for name in a.keys() & parameters.keys():
         a[name][:] = parameters[name].numpy()
     axis, offset = Axis(*(v.ravel() for v in axis_of(a))), a["offset"].ravel()

@@ -203,8 +203,8 @@ class Problem:
             load = mass[:, None, None] * self.carried[axis[:, None], rows]
             torque = load if self.torque is None else load + self.torque[axis[:, None], rows]
             # Each model has runs of its own then.
-            drive = Drive(*(None if v is None else v[which.flatten() % len(v)] for v in drive))
-            drive = drive._replace(torque=torque.flatten(0, 1))
+            at = {name: v[which.flatten() % len(v)] for name, v in drive._asdict().items() if v is not None}
+            drive = drive._replace(**at | {"torque": torque.flatten(0, 1)})
             which = torch.arange(which.numel()).reshape(which.shape)
         moved = simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
         for name, value in own.items():
