@@ -7,6 +7,7 @@ block's number is the exit code that is expected, 0 without one. A line `head` o
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shlex
@@ -14,7 +15,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import redirect_stderr, redirect_stdout
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +44,16 @@ def run_all() -> None:
         found = {text: int(code or 0) for code, text in BLOCK.findall(page.read_text(encoding="utf-8"))}
         # What several pages show is run once.
         pages.append({text: code for text, code in found.items() if not any(text in other for other in pages)})
-    with ThreadPoolExecutor(2) as pool:
+    # Each process loads the package once. Spawned: a forked one shares locks with torch.
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn"), initializer=_begin) as pool:
         for shown in pool.map(_run_page, pages):
             screens.update(shown)
+
+
+def _begin() -> None:
+    """As on a terminal of this width, so that lines are wrapped; the package reads this when it is loaded."""
+    os.environ |= {"COLUMNS": WIDTH, "TTY_COMPATIBLE": "1"}
+    os.chdir(FOLDER)
 
 
 def _run_page(blocks: Mapping[str, int]) -> dict[str, str]:
@@ -55,15 +65,29 @@ def _run(text: str, code: int) -> str:
     for command in text.replace("\\\n", "\0").splitlines():
         shown.append(f"$ {command}".replace("\0", "\\\n"))
         words = shlex.split(command.replace("\0", " "), comments=True)
-        # As on a terminal of this width, so that lines are wrapped; its colours are taken out again.
-        env = os.environ | {"COLUMNS": WIDTH, "TTY_COMPATIBLE": "1", "PYTHONPATH": str(HERE.parent)}
-        line = [sys.executable, "-m", "ccnn_torch", *words[1:]] if words[0] == "ccnn" else words
-        done = subprocess.run(line, cwd=FOLDER, env=env, capture_output=True, text=True, check=False)
-        if done.returncode != code:
-            raise ExtensionError(f"{command}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
-        said = done.stdout + (done.stderr if code == 2 else "")
+        done, out, err = _called(words[1:]) if words[0] == "ccnn" else _started(words)
+        if done != code:
+            raise ExtensionError(f"{command}: exit code {done}\n{out}{err}")
+        said = out + (err if code == 2 else "")
         shown += [line.rstrip() for line in re.sub(r"\x1b\[[0-9;]*m", "", said).splitlines()]
     return "\n".join(shown)
+
+
+def _called(words: list[str]) -> tuple[int, str, str]:
+    from ccnn_torch.cli.application import main
+
+    sys.argv, code = ["ccnn", *words], 0
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        try:
+            main()
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+    return code, out.getvalue(), err.getvalue()
+
+
+def _started(words: list[str]) -> tuple[int, str, str]:
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout, done.stderr
 
 
 class Screen(SphinxDirective):

@@ -89,7 +89,7 @@ def _enter(results: Block, table: Table, about: About) -> Answer:
         text = f"{len(shown)} of {count} numbers, ± at 95 %; only all together repair the model: {kept}report.html."
     else:
         more = f"{count - len(shown)} more are in {kept}report.html" if count > len(shown) else "if nothing else acts"
-        text = f"all of these together, ± at 95 %; {more}." if len(shown) > 1 else f"± at 95 %; {more}."
+        text = f"{'all of these together, ' * (len(enters) > 1)}± at 95 %; {more}."
     return Answer("Enter instead" if enters else "Numbers found", text, tuple(_line(row) for row in shown), table)
 
 
