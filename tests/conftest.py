@@ -33,7 +33,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def _blank_figures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Figures are made and written, but blank: drawing them is a third of a run with a page.
+    """Figures are made and written, but blank and of a few pixels: drawing them is a third of a run with a page.
 
     Not in tests/report, nor in a module that says `DRAWN = True`.
     """
@@ -41,6 +41,7 @@ def _blank_figures(request: pytest.FixtureRequest) -> Iterator[None]:
         if "report" not in request.path.parts and not hasattr(request.module, "DRAWN"):
             patch.setattr(Figure, "draw", lambda figure, renderer: None)
             patch.setattr(Figure, "get_layout_engine", lambda figure: None)
+            patch.setattr("ccnn_torch.report.figures._PNG_DPI", 5)
         yield
 
 

@@ -58,6 +58,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "five_bar",
         "--out",
         str(folder / "found"),
+        "--no-network",
         "--quiet",
     ]
     words += ["--effects", "compliance,joint_gain,backlash,gravity,drift"]
@@ -147,7 +148,7 @@ def test_a_run_from_the_command_line_and_its_files(cli: Cli, tmp_path: Path) -> 
     rows, out = tmp_path / "rows.csv", tmp_path / "run"
     words = ("--mechanism", "five_bar", "--effect", "joint_gain", "--rows", "80", "--noise", "5e-6", "--seed", "3")
     assert cli("simulate", *words, "--out", rows, "--quiet")[0] == 0
-    found = ("--effects", "joint_gain,backlash", "--out", tmp_path / "found", "--quiet")
+    found = ("--effects", "joint_gain,backlash", "--no-network", "--out", tmp_path / "found", "--quiet")
     assert cli("diagnose", "--records", rows, *words[:2], *found)[0] == 0
     (tmp_path / "c.yaml").write_text("records: rows.csv\nmechanism: five_bar\nmethods: [constant]\n", encoding="utf-8")
     effects = f"effects=from:{tmp_path / 'found' / 'diagnosis.json'}"

@@ -167,7 +167,7 @@ def test_a_diagnosis_weighs_what_was_measured(tmp_path: Path) -> None:
     # The gap is that of the rows in which there is one.
     gap = said.content["gap_rotation"]
     there = load_records(tmp_path / "whole.csv", machine, learns=False)
-    alone = diagnose(there, machine, effects=["geometry", "joint_gain", "backlash"]).content["gap_rotation"]
+    alone = diagnose(there, machine, effects=["joint_gain"]).content["gap_rotation"]
     assert abs(gap["before"] / alone["before"] - 1) < 0.1
 
 

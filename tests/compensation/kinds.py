@@ -107,8 +107,9 @@ def little(joints: int, covariates: int, nodes: int, turning: bool) -> Compensat
 
 
 def little_arm() -> Compensator:
-    """One link that turns between limits just outside of what was measured."""
-    arm = SerialArm("one", "standard", [[0.4, 0.0, 0.0, 0.0]], limits=[[-0.1, 1.1]], orientation="none")
+    """One link that slides between limits just outside of what was measured: the fewest operations of a machine."""
+    links, limits = [[0.4, 0.0, 0.0, 0.0]], [[-0.1, 1.1]]
+    arm = SerialArm("one", "standard", links, joint_types=["prismatic"], limits=limits, orientation="none")
     joints = torch.rand(60, 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     return near(arm, 1e-4, joints).compensator()
 
@@ -126,7 +127,7 @@ def expanded() -> Compensator:
 
 
 # Of these the others hold everything that a form has; to trace them again takes time.
-_EAGER_ALONE = ("arm", "arm with effects", "tripod")
+_EAGER_ALONE = ("arm", "arm with effects", "arm by positions", "five axes", "tripod")
 KINDS: dict[str, Callable[[], Compensator]] = {
     "tripod": tripod_compensator,
     "covariates": arm_compensator,

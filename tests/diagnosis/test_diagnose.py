@@ -127,7 +127,7 @@ def test_nothing_but_bad_rows_is_outlier() -> None:
     situation = rows_of("five_bar", 200, 11)
     pose = measured(situation, {}, 12)
     pose[[10, 20, 30]] += 80 * NOISE
-    said = diagnose_rows(situation, pose)
+    said = diagnose_rows(situation, pose, effects=["geometry", "joint_offset", "backlash", "compliance"])
     assert said.verdict["effects"] == ["outlier"] and not said.verdict["none"]
     assert set(said.rows_set_aside) == {10, 20, 30, *near_singular(said)}
 
@@ -143,7 +143,7 @@ def test_one_row_of_a_heavy_tail_is_no_cause_and_one_far_beyond_is() -> None:
     for times, none in ((25, True), (150, False)):
         pose = measured(situation, {}, 12)
         pose[20, 0] += times * NOISE
-        said = diagnose_rows(situation, pose)
+        said = diagnose_rows(situation, pose, effects=["geometry", "joint_offset", "backlash", "compliance"])
         assert said.verdict["none"] is none and (20 in said.rows_set_aside)
         assert said.verdict["effects"] == ([] if none else ["outlier"])
 

@@ -57,7 +57,7 @@ def test_a_new_zero_each_day_is_named_alone() -> None:
 
 @pytest.mark.parametrize("wrong", ["", "drift", "joint_offset"])
 def test_pauses_alone_are_no_new_zeros(wrong: str) -> None:
-    for seed in range(10):
+    for seed in range(3):
         said = diagnose_rows(*measured(seed, wrong)).verdict
         assert said["effects"] == ([wrong] if wrong else []), (seed, said)
 

@@ -25,7 +25,7 @@ def test_an_error_of_one_joint_is_found_in_that_joint_and_its_leg(machine: str, 
     rows = rows_of(machine, 120, 0)
     deviation = torch.zeros_like(rows.joints)
     deviation[:, joint] = size
-    said = diagnose_rows(rows, _measured(rows, deviation))
+    said = diagnose_rows(rows, _measured(rows, deviation), effects=["joint_offset", "joint_gain"])
     for group, name in (("joints", f"q{joint + 1}"), ("legs", f"leg {joint + 1}")):
         shares, intervals = said.where[group], said.where_ci95[group]
         assert max(shares, key=shares.get) == name and shares[name] > 0.95
@@ -37,7 +37,7 @@ def test_an_error_in_one_region_is_found_in_that_region() -> None:
     x, y = rows.pose[:, 0], rows.pose[:, 1]
     inside = (x > x.quantile(2 / 3)) & (y < y.quantile(1 / 3))
     deviation = 3e-4 * inside[:, None].double() * torch.tensor([1.0, -1.0], dtype=torch.float64)
-    said = diagnose_rows(rows, _measured(rows, deviation))
+    said = diagnose_rows(rows, _measured(rows, deviation), effects=["joint_offset", "joint_gain"])
     regions, intervals = said.where["regions"], said.where_ci95["regions"]
     assert len(regions) == 9 and sum(r["rows"] for r in regions) > 300
     best = max(range(9), key=lambda i: regions[i]["share"])
@@ -51,7 +51,7 @@ def test_an_error_in_the_cold_and_one_from_one_side_are_found_in_their_regimes()
     cold = rows.covariates["temperature"] < rows.covariates["temperature"].quantile(1 / 3)
     came_back = rows.covariates["direction1"] < 0
     deviation = 3e-4 * (cold & came_back)[:, None].double().expand(-1, 2)
-    said = diagnose_rows(rows, _measured(rows, deviation))
+    said = diagnose_rows(rows, _measured(rows, deviation), effects=["joint_offset", "joint_gain"])
     regimes, intervals = said.where["covariates"], said.where_ci95["covariates"]
     assert regimes["temperature"][0]["share"] > 0.9 and intervals["temperature"][0][0] > 0.85
     assert [r["from"] for r in regimes["direction1"]] == [-1.0, 1.0]
@@ -63,7 +63,9 @@ def test_an_error_in_the_cold_and_one_from_one_side_are_found_in_their_regimes()
 
 def test_every_list_of_shares_sums_to_one_inside_its_intervals() -> None:
     rows = rows_of("delta", 60, 3)
-    said = diagnose_rows(rows, _measured(rows, 2e-4 * torch.sin(5 * rows.joints)))
+    said = diagnose_rows(
+        rows, _measured(rows, 2e-4 * torch.sin(5 * rows.joints)), effects=["joint_offset", "joint_gain"]
+    )
     where, known = said.where, said.where_ci95
     lists = [(list(where[g].values()), list(known[g].values())) for g in ("outputs", "joints", "legs")]
     lists.append(([r["share"] for r in where["regions"]], known["regions"]))

@@ -20,7 +20,7 @@ ARM = Path(__file__).parents[1] / "effects" / "arm.yaml"
 def test_two_causes_are_drawn_against_what_drives_each() -> None:
     rows = rows_of("five_bar", 160, 0)
     poses = measured(rows, {"compliance": 10.0, "backlash": 8.0}, 1)
-    found = diagnose_rows(rows, poses)
+    found = diagnose_rows(rows, poses, None, ["geometry", "joint_offset", "compliance", "backlash"])
     arrays, labels = picture_arrays(found)
     assert set(labels) == {"compliance", "backlash"} == set(found.verdict["effects"])
     assert all(value.dtype == torch.float64 and bool(value.isfinite().all()) for value in arrays.values())

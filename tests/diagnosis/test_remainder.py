@@ -7,7 +7,9 @@ from diagnosis._machines import NOISE, pose_of, rows_of
 from torch import Tensor
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
+from ccnn_torch.diagnosis.engine import candidates
 from ccnn_torch.diagnosis.residual.linearisation import remainder
+from ccnn_torch.diagnosis.search.analysis import analyse
 from ccnn_torch.diagnosis.verdict.remainder import Remainder, remainder_of, rest_of
 from ccnn_torch.effects import Acting, Situation, make_effect, reached
 from ccnn_torch.evidence.dictionary import FittedSet
@@ -17,7 +19,7 @@ ROWS = 150
 
 def left_by(situation: Situation, pose: Tensor, names: set[str]) -> tuple[Remainder, tuple[str, ...] | None, FittedSet]:
     """What the most probable set of these names leaves, and what is said of it."""
-    analysis = diagnose_rows(situation, pose, effects=sorted(names | {"backlash"})).analysis
+    analysis = analyse(situation, pose, candidates(situation, sorted(names | {"backlash"}))[0], None, None)
     sets = ({analysis.atoms[i].name for i in f.members} for f in analysis.found)
     found = next(f for f, own in zip(analysis.found, sets, strict=True) if own == names)
     rest = remainder_of(analysis, found)

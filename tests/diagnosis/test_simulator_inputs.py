@@ -20,11 +20,13 @@ from ccnn_torch.records import load_records
 from ccnn_torch.simulation.job import simulate_records, write_simulated
 
 EXACT = torch.full((3,), NOISE, dtype=torch.float64)
+# Where no other effect is in question.
+FEW = ["geometry", "joint_offset", "compliance", "backlash"]
 
 
 def test_effects_are_added_in_order_the_largest_first() -> None:
     rows = rows_of("five_bar", 150, 3)
-    said = diagnose_rows(rows, measured(rows, {"compliance": 12.0, "backlash": 6.0}, 4))
+    said = diagnose_rows(rows, measured(rows, {"compliance": 12.0, "backlash": 6.0}, 4), None, FEW)
     steps = said.in_order
     assert [s["name"] for s in steps] == said.verdict["effects"] and len(steps) > 1
     gaps = [said.gap["before"], *(s["gap_after"] for s in steps)]
@@ -148,7 +150,7 @@ def test_every_row_set_aside_has_its_reason() -> None:
     poses = measured(rows, {"joint_offset": 8.0}, 11)
     poses[40] += 100 * NOISE
     poses[50] += 10.0
-    said = diagnose_rows(rows, poses)
+    said = diagnose_rows(rows, poses, None, FEW)
     why = dict(zip(said.rows_set_aside, said.why_set_aside, strict=True))
     assert why[40] == "far from what any fit to the other rows says"
     assert why[50] == "far from where its joints put it"

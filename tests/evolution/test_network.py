@@ -20,7 +20,7 @@ def parts(layers: list[Genome]) -> tuple[list[Tensor], list[Tensor]]:
     return [layer.mask for layer in layers], [layer.weight for layer in layers]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(SIZES, st.sampled_from([0.0, 0.15, 0.4, 1.0]), st.booleans(), st.integers(0, 2**31))
 def test_forward_pruned_and_exported_network_give_the_naive_numbers(
     sizes: list[int], density: float, bias: bool, seed: int
@@ -42,7 +42,7 @@ def test_forward_pruned_and_exported_network_give_the_naive_numbers(
         assert torch.allclose(network(inputs[k]), together[k], rtol=0, atol=1e-13)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(SIZES, st.sampled_from([0.15, 0.5, 1.0]), st.booleans(), st.integers(1, 4), st.integers(0, 2**31))
 def test_the_average_of_networks_is_one_network(
     sizes: list[int], density: float, bias: bool, members: int, seed: int
@@ -58,7 +58,7 @@ def test_the_average_of_networks_is_one_network(
         assert [int(m.sum()) for m in wide_masks] == [int(m.sum()) for m in masks]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(SIZES, st.sampled_from([0.1, 0.3, 0.6]), st.integers(0, 2**31))
 def test_dead_nodes_are_those_that_deletion_leaves(sizes: list[int], density: float, seed: int) -> None:
     layers = naive.random_layers(sizes, (4,), density, True, torch.Generator().manual_seed(seed))

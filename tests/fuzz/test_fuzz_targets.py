@@ -39,7 +39,7 @@ LONGEST = 80_000
 Array = NDArray[Any]
 MODELS = {"little": lambda: little(1, 1, 2, turning=True), **KINDS}
 # The order of a sum is the compiler's without these; what is undefined ends the program.
-SANITIZED = ["-O1", "-g", *STRICT[1:], "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+SANITIZED = ["-O0", "-g", *STRICT[1:], "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 BUILDS = {"gcc": ("gcc", STRICT), "gcc -O3": ("gcc", ["-O3", *STRICT[1:]]), "sanitized": ("gcc", SANITIZED)}
 BUILDS |= {"clang": ("clang", ["-O2", *STRICT[1:]]), "clang, sanitized": ("clang", SANITIZED)}
 

@@ -35,12 +35,14 @@ class Arm:
         self.a, self.d, self.alpha = A + a, D + d, ALPHA + alpha
 
     def flange(self, q: Array) -> tuple[Array, Array]:
-        """Rotation and place of the flange with joints `6`."""
+        """Rotation and place of the flange with joints `... x 6`."""
         rotation, place = np.eye(3), np.zeros(3)
-        for a, d, alpha, angle in zip(self.a, self.d, self.alpha, q + self.theta, strict=True):
+        for a, d, alpha, angle in zip(self.a, self.d, self.alpha, np.moveaxis(q + self.theta, -1, 0), strict=True):
             c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
-            place = place + rotation @ [a * c, a * s, d]
-            rotation = rotation @ np.array([[c, -s * ca, s * sa], [s, c * ca, -c * sa], [0, sa, ca]])
+            one = np.ones_like(c)
+            link = np.array([[c, -s * ca, s * sa], [s, c * ca, -c * sa], [0 * one, sa * one, ca * one]])
+            place = place + np.einsum("...ij,j...->...i", rotation, np.array([a * c, a * s, d * one]))
+            rotation = rotation @ np.moveaxis(link, (0, 1), (-2, -1))
         return rotation, place
 
     def tip(self, q: Array) -> Array:

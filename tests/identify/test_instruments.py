@@ -30,6 +30,7 @@ from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.compensation.model_files.identified import load_machine
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification.identify import Identification
 from ccnn_torch.mechanisms import Instrument, load_mechanism, mechanism_from_description
 from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.planning.job import make_plan
@@ -48,9 +49,18 @@ def _camera(folder: Path) -> dict[str, Any]:
     return {"records": str(records), "mechanism": "instrument", "mechanism_keys": keys}
 
 
-def test_pixels_of_a_board_identify_the_arm_its_mounting_and_the_lens(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Identification]:
+    """Keys of a camera over a board, and what was identified from its pixels; read only."""
+    keys = _camera(tmp_path_factory.mktemp("board"))
+    return keys, identify(**keys, noise="0.2 px", seed=0)
+
+
+def test_pixels_of_a_board_identify_the_arm_its_mounting_and_the_lens(
+    seen: tuple[dict[str, Any], Identification], tmp_path: Path
+) -> None:
     """The reference is the noise: of two coordinates of 0.2 pixels, on images that were held out whole."""
-    found = identify(**_camera(tmp_path), noise="0.2 px", seed=0)
+    found = seen[1]
     held_out = found.results["test"]["position"]
     assert 0.9 < held_out["after"] / (math.sqrt(2) * 0.2 * PIXEL) < 1.25
     assert held_out["before"] > 4 * held_out["after"]
@@ -63,13 +73,13 @@ def test_pixels_of_a_board_identify_the_arm_its_mounting_and_the_lens(tmp_path: 
     q, columns = images(Arm(0), 6, 99, 0.0)
     rows = torch.from_numpy(np.column_stack([columns["u[px]"], columns["v[px]"]]) * PIXEL)
     given = torch.from_numpy(np.column_stack([columns[f"board_{a}[m]"] for a in "xyz"]))
-    seen = machine.forward_kinematics(torch.from_numpy(q), guess=torch.cat([rows, given], -1))[:, :2]
-    assert float((seen - rows).norm(dim=-1).square().mean().sqrt()) < 0.6 * PIXEL
+    again = machine.forward_kinematics(torch.from_numpy(q), guess=torch.cat([rows, given], -1))[:, :2]
+    assert float((again - rows).norm(dim=-1).square().mean().sqrt()) < 0.6 * PIXEL
     # Its file is the machine with the camera as found, and nothing of it is fitted anew.
     found.save(tmp_path / "found")
-    again = load_mechanism(str(tmp_path / "found" / "identified.yaml"))
-    assert isinstance(again, Instrument) and again.unknown_frames == ()
-    torch.testing.assert_close(again.nominal, machine.nominal, rtol=0, atol=1e-12)
+    read = load_mechanism(str(tmp_path / "found" / "identified.yaml"))
+    assert isinstance(read, Instrument) and read.unknown_frames == ()
+    torch.testing.assert_close(read.nominal, machine.nominal, rtol=0, atol=1e-12)
 
 
 def test_corners_of_a_board_that_is_not_as_drawn_are_found_along(tmp_path: Path) -> None:
@@ -151,14 +161,14 @@ def _apart(wanted: list[Array], reached: list[Array]) -> float:
 
 def _wire(folder: Path, arm: Arm, q: Array, seed: int) -> Path:
     number = np.arange(len(q)) % 3
-    tips = np.array([arm.tip(v) for v in q])
+    tips = arm.tip(q)
     noise = np.random.default_rng(seed).normal(0, 2e-5, len(q))
     far = np.linalg.norm(tips - ANCHORS[number], axis=1) + noise
     return write(folder / "wire.csv", q, {"anchor[1]": number + 1.0, "distance[m]": far})
 
 
 def _level(folder: Path, arm: Arm, q: Array, seed: int) -> Path:
-    up = np.array([arm.flange(v)[0][2, :2] for v in q])
+    up = arm.flange(q)[0][:, 2, :2]
     tilt = np.arcsin(up) + np.random.default_rng(seed).normal(0, 2e-5, up.shape)
     return write(folder / "level.csv", q, {"tilt_x[rad]": tilt[:, 0], "tilt_y[rad]": tilt[:, 1]})
 
@@ -184,7 +194,7 @@ def test_rows_of_a_gauge_a_level_and_wires_stand_in_one_fit(tmp_path: Path) -> N
     arm = Arm(4)
     files = [_level(tmp_path, arm, joints(80, 5), 6), _wire(tmp_path, arm, joints(80, 7), 8)]
     pairs = joints(160, 9).reshape(80, 2, 6)
-    far = np.array([np.linalg.norm(arm.tip(a) - arm.tip(b)) for a, b in pairs])
+    far = np.linalg.norm(arm.tip(pairs[:, 0]) - arm.tip(pairs[:, 1]), axis=-1)
     names = {f"q{i + 1}_b[rad]": pairs[:, 1, i] for i in range(6)}
     rows = write(tmp_path / "pairs.csv", pairs[:, 0], {**names, "distance[m]": far})
     beside = [
@@ -218,19 +228,17 @@ def test_two_arms_that_hold_one_ball_are_one_machine(tmp_path: Path) -> None:
     one, other = Arm(1), Arm(2)
     base = turn([0.003, -0.004, 3.1]), np.array([-1.0, 0.02, 0.01])
     rng = np.random.default_rng(0)
-    rows: list[Array] = []
-    while len(rows) < 100:
-        q = np.concatenate([joints(1, int(rng.integers(1 << 30)))[0] for _ in range(2)])
+    q = np.concatenate([joints(160, 1), joints(160, 2)], -1)
 
-        def gap(v: Array) -> Array:
-            return np.asarray(base[1] + base[0] @ other.tip(v[6:]) - one.tip(v[:6]))
+    def gap(v: Array) -> Array:
+        return np.asarray(base[1] + other.tip(v[..., 6:]) @ base[0].T - one.tip(v[..., :6]))
 
-        for _ in range(25):
-            slope = np.stack([(gap(q + 1e-6 * e) - gap(q - 1e-6 * e)) / 2e-6 for e in np.eye(12)], -1)
-            step = np.linalg.pinv(slope) @ gap(q)
-            q = q - step / max(1.0, 2 * float(np.abs(step).max()))
-        if np.linalg.norm(gap(q)) < 1e-9:
-            rows.append(q + rng.normal(0, 1e-5, 12))
+    for _ in range(25):
+        slope = np.stack([(gap(q + 1e-6 * e) - gap(q - 1e-6 * e)) / 2e-6 for e in np.eye(12)], -1)
+        step = (np.linalg.pinv(slope) @ gap(q)[..., None])[..., 0]
+        q = q - step / np.maximum(1.0, 2 * np.abs(step).max(-1, keepdims=True))
+    rows = q[np.linalg.norm(gap(q), axis=-1) < 1e-9][:100]
+    rows = rows + rng.normal(0, 1e-5, rows.shape)
     names = [f"{arm}_q{i + 1}[rad]" for arm in ("first", "second") for i in range(6)]
     table = np.column_stack([rows, np.zeros((100, 3))])
     header = ",".join([*names, "x[m]", "y[m]", "z[m]"])
@@ -306,10 +314,11 @@ def test_poses_are_planned_for_an_instrument(tmp_path: Path, keys: dict[str, Any
         assert set(plans[0].pose[:, 1].tolist()) == {1.0, 2.0}
 
 
-def test_a_model_is_verified_by_the_pixels_of_another_day(tmp_path: Path) -> None:
+def test_a_model_is_verified_by_the_pixels_of_another_day(
+    seen: tuple[dict[str, Any], Identification], tmp_path: Path
+) -> None:
     """The lens that was found goes with the new rows: the model is of the arm."""
-    keys = _camera(tmp_path)
-    found = identify(**keys, noise="0.2 px", seed=0)
+    keys, found = seen
     found.save(tmp_path / "found")
     later = write(tmp_path / "later.csv", *images(Arm(0), 6, 50, 0.2))
     machine = found.mechanism()

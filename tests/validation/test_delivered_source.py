@@ -330,7 +330,13 @@ def test_a_compiled_function_gets_joints_and_covariates(tmp_path, monkeypatch):
 def test_one_machine_from_start_to_end(tmp_path):
     machine = draw("five_bar", 1)
     row = judged(
-        machine, 40, 12, "run", ("safetensors",), ("methods=constant", "geometry=none", "effects=none"), tmp_path
+        machine,
+        40,
+        12,
+        "run",
+        ("safetensors",),
+        ("methods=constant", "geometry=none", "effects=none", "save_report=false"),
+        tmp_path,
     )
     assert row["said"] == ""
     for name in (*(f"safetensors_{name}_mm" for name in SETS), "promised_mm", "before_mm"):
