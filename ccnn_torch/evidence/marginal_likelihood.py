@@ -256,6 +256,14 @@ class _Parts(NamedTuple):
         return torch.cat([first[:, None], (rest[:, None] @ self.member)[:, 0]], -1)
 
 
+def _to_begin_with(parts: _Parts, there: Tensor, yy: Tensor, prior: Prior) -> tuple[Tensor, Tensor]:
+    """log α² of each group where its prior could make the whole gap, `b x g`, and σ², a tenth of it, `b`."""
+    trace = parts.by_group(parts.square.sum(-1), parts.own.diagonal(dim1=-2, dim2=-1)).clamp_min(1e-300)
+    psi = torch.log((yy[:, None].clamp_min(1e-300) / trace).clamp(math.exp(-_LIMIT), math.exp(_LIMIT))) * there
+    noise = torch.ones_like(yy) if prior.noise_dof > 0 else (yy / prior.values / _FIRST_NOISE).clamp_min(1e-12)
+    return psi, noise
+
+
 def _most_probable(
     parts: _Parts, there: Tensor, yy: Tensor, prior: Prior, updates: int, start: tuple[Tensor, Tensor] | None = None
 ) -> Fits:
@@ -273,12 +281,7 @@ def _most_probable(
     square, along_first, across, own, along_rest, member = parts
     edge = own.diagonal(dim1=-2, dim2=-1)
     yy = yy.expand(len(square))
-    if start is None:
-        trace = parts.by_group(square.sum(-1), edge).clamp_min(1e-300)
-        psi = torch.log((yy[:, None].clamp_min(1e-300) / trace).clamp(math.exp(-_LIMIT), math.exp(_LIMIT))) * there
-        noise = torch.ones_like(yy) if prior.noise_dof > 0 else (yy / prior.values / _FIRST_NOISE).clamp_min(1e-12)
-        start = psi, noise
-    psi, noise = start
+    psi, noise = _to_begin_with(parts, there, yy, prior) if start is None else start
     for k in range(updates + 1):
         half, sigma = (psi / 2).exp(), noise.sqrt()[:, None]
         scale_first, scale_rest = half[:, :1], (member @ half[:, 1:, None])[..., 0]

@@ -41,7 +41,7 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
     Raises:
         MethodFailedError: a grid of so many joints would have less than three points along each.
     """
-    joints, n = compensator.joints, len(compensator.joints)
+    n = len(compensator.joints)
     count = min(_ALONG, int(_MOST ** (1 / n)))
     if count < 3:
         raise MethodFailedError(f"a table over {n} joints would be too coarse; export the model as c99 or st")
@@ -55,6 +55,33 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
     truth = _deviation(compensator, checked, middle)
     tables = {"table.csv": _csv(compensator, grid.reshape(-1, n), values.reshape(-1, n))}
     told = [_said("table.csv", "all joints, linear between the points", truth, _between(lines, values, checked))]
+    axes, rows, said = _axis_tables(compensator, low, high, drawn)
+    tables |= axes
+    told.append(rows)
+    if mechanism is not None and _is_cartesian(mechanism):
+        lines = [np.linspace(a, b, _RECORDS) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
+        values = _deviation(compensator, grid.reshape(-1, n), middle).reshape(grid.shape)
+        tables["beckhoff_grid.csv"] = _isg(grid.reshape(-1, n), values.reshape(-1, n))
+        told.append(
+            _said("beckhoff_grid.csv", "X, Y, Z, linear between the points", truth, _between(lines, values, checked))
+        )
+    if mechanism is not None and [c.name for c in mechanism.pose] == ["x", "y", "z"]:
+        tables["klipper_mesh.cfg"], sentence = _mesh(compensator, mechanism)
+        told.append(sentence)
+    told += said
+    told += [text for form, text in _FORMS.items() if any(name.startswith(form) for name in tables)]
+    stand = zip(compensator.covariates, middle.tolist(), strict=True)
+    at = ", ".join(f"`{f'{plain(c.name)} = {v:.6g} {plain(c.unit)}'.removesuffix(' 1')}`" for c, v in stand)
+    return tables | {"README.md": README.format(told="\n\n".join(told), at=f" Covariates stand at {at}." if at else "")}
+
+
+def _axis_tables(
+    compensator: Compensator, low: Array, high: Array, drawn: Array
+) -> tuple[dict[str, str], str, list[str]]:
+    """Files of the joints for which an own table suffices, what each leaves, and what is said of their directions."""
+    joints = compensator.joints
+    tables: dict[str, str] = {}
     rows, lost, joined, files = [], [], [], identifiers([joint.name for joint in joints])
     for j, joint in enumerate(joints):
         name, scale = _NAMES.get(joint.unit, (plain(joint.unit), 1.0))
@@ -76,29 +103,16 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
             tables[f"linuxcnc_{files[j]}.comp"] = _screw(line * scale, *own * scale)
             tables[f"beckhoff_axis_{files[j]}.lis"] = _ssfk(j + 1, files[j], joint.unit, line, *own)
             tables[f"heidenhain_{files[j]}.com"] = _heidenhain(files[j], name, line * scale, *own * scale)
-    axes = "| joint | deviation, RMS | left by its own table, RMS | at most | one axis suffices |\n"
-    told.append(axes + "| --- | --- | --- | --- | --- |\n" + "\n".join(rows))
-    if mechanism is not None and _is_cartesian(mechanism):
-        lines = [np.linspace(a, b, _RECORDS) for a, b in zip(low, high, strict=True)]
-        grid = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
-        values = _deviation(compensator, grid.reshape(-1, n), middle).reshape(grid.shape)
-        tables["beckhoff_grid.csv"] = _isg(grid.reshape(-1, n), values.reshape(-1, n))
-        told.append(
-            _said("beckhoff_grid.csv", "X, Y, Z, linear between the points", truth, _between(lines, values, checked))
-        )
-    if mechanism is not None and [c.name for c in mechanism.pose] == ["x", "y", "z"]:
-        tables["klipper_mesh.cfg"], sentence = _mesh(compensator, mechanism)
-        told.append(sentence)
+    head = "| joint | deviation, RMS | left by its own table, RMS | at most | one axis suffices |\n"
+    told = head + "| --- | --- | --- | --- | --- |\n" + "\n".join(rows)
+    said = []
     if lost:
         but = f" (not those of {', '.join(joined)}: the model knows its direction only with others')" if joined else ""
-        told.append(
+        said.append(
             f"Directions of approach: tables of single axes hold both{but}. Every other file stands between them, and "
             f"leaves in either direction {', '.join(lost)} (RMS)."
         )
-    told += [text for form, text in _FORMS.items() if any(name.startswith(form) for name in tables)]
-    stand = zip(compensator.covariates, middle.tolist(), strict=True)
-    at = ", ".join(f"`{f'{plain(c.name)} = {v:.6g} {plain(c.unit)}'.removesuffix(' 1')}`" for c, v in stand)
-    return tables | {"README.md": README.format(told="\n\n".join(told), at=f" Covariates stand at {at}." if at else "")}
+    return tables, told, said
 
 
 README = """# Error tables

@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis.residual.distance import USUAL, Size, distance, size_o
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.errors import InputError, RowsError
-from ccnn_torch.mechanisms import BlackBox, Framed, Seen, SerialArm
+from ccnn_torch.mechanisms import BlackBox, Framed, Mechanism, Seen, SerialArm
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form, fit_frames
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.headers import EULER_ANGLES
@@ -88,8 +88,16 @@ def late_rows(situation: Situation, measured: Tensor, size: Size, anew: bool = F
 
 def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Situation, Tensor]]:
     """What is wrong, in words, and the rows as they would be without it."""
-    mechanism = situation.mechanism
-    pose, joints = mechanism.pose, mechanism.joints
+    yield from _of_pose(situation, measured)
+    inner = situation.mechanism.mechanism if isinstance(situation.mechanism, Framed) else situation.mechanism
+    # Of a simulator each of the others would be simulated anew, which may take long.
+    if not isinstance(inner, BlackBox):
+        yield from _of_model_and_joints(situation, measured, inner)
+
+
+def _of_pose(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Situation, Tensor]]:
+    """In the measured pose."""
+    pose = situation.mechanism.pose
     lengths = torch.tensor([c.unit == "m" for c in pose])
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
         corrected = torch.where(lengths, factor * measured, measured)
@@ -116,10 +124,13 @@ def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Sit
         if pose[i].unit == pose[k].unit:
             words = f"{pose[i].name} and {pose[k].name} of the pose seem to be swapped"
             yield words, situation, _swapped(measured, i, k)
-    inner = mechanism.mechanism if isinstance(mechanism, Framed) else mechanism
-    if isinstance(inner, BlackBox):
-        # Each of these would be simulated anew, which may take long.
-        return
+
+
+def _of_model_and_joints(
+    situation: Situation, measured: Tensor, inner: Mechanism
+) -> Iterator[tuple[str, Situation, Tensor]]:
+    """In the model's file or in the joints; inner: the mechanism without the frames around it."""
+    mechanism, joints = situation.mechanism, situation.mechanism.joints
     turns = torch.tensor([g.unit == "rad" for g in inner.geometry])
     if inner is mechanism and bool(turns.any()):
         corrected = torch.where(turns, inner.nominal / _TURN, inner.nominal)

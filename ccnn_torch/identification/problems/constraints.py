@@ -83,16 +83,9 @@ def socket_problem(
     group, parts = _placements(placement, rows)
     if points.shape != (len(joints), 3):
         raise InputError(f"points must be one place on the plate for each of {len(joints)} rows, got {points.shape}")
-    distinct = torch.unique(points, dim=0)
-    extent = float(torch.cdist(distinct, distinct).max())
     unknown, turned, turns = [], torch.zeros_like(points), torch.zeros(len(joints), 9, dtype=torch.float64)
     if plate_tolerance > 0:
-        if noise is None:
-            raise InputError("plate_tolerance: it can be weighed against the rows only if their noise is given")
-        if extent == 0:
-            raise InputError("plate_tolerance: a plate with a single socket has no scale; leave it out")
-        sd = plate_tolerance / extent
-        unknown.append(_Unknown("plate_scale", "1", 1.0, sd, sd))
+        unknown.append(_plate_scale(points, plate_tolerance, noise))
     columns = torch.zeros(len(joints), 6, dtype=torch.int64)
     for g, (label, mine) in enumerate(parts):
         rotation, place, axes = _plate_start(points[mine], at[mine])
@@ -129,6 +122,18 @@ def socket_problem(
     )
     check_equations(problem)
     return problem
+
+
+def _plate_scale(points: Tensor, tolerance: float, noise: float | None) -> _Unknown:
+    """The scale of a plate that is not exactly as drawn; raises InputError where it cannot be fitted."""
+    if noise is None:
+        raise InputError("plate_tolerance: it can be weighed against the rows only if their noise is given")
+    distinct = torch.unique(points, dim=0)
+    extent = float(torch.cdist(distinct, distinct).max())
+    if extent == 0:
+        raise InputError("plate_tolerance: a plate with a single socket has no scale; leave it out")
+    sd = tolerance / extent
+    return _Unknown("plate_scale", "1", 1.0, sd, sd)
 
 
 def scatter(points: Tensor, group: Tensor, weights: Tensor) -> Tensor:

@@ -138,6 +138,13 @@ def compares_poses(mechanism: Mechanism) -> bool:
     return computed and len(mechanism.joints) > len(mechanism.pose)
 
 
+def _plain(mechanism: Mechanism) -> Mechanism:
+    """The machine itself, without set-ups and given numbers around it."""
+    while isinstance(mechanism, SetUps | Giving):
+        mechanism = mechanism.machine
+    return mechanism
+
+
 def forward_problem(
     mechanism: Mechanism,
     joints: Tensor,
@@ -182,9 +189,7 @@ def forward_problem(
     turns = (rotation_vector_to_matrix(rows.pose[..., turning]).flatten(-2),) if turning else ()
     seen = None if bool(known.all()) else known[..., order].reshape(-1, rows.pose.shape[-2], len(order))
 
-    plain = mechanism
-    while isinstance(plain, SetUps | Giving):
-        plain = plain.machine
+    plain = _plain(mechanism)
 
     def difference(full: Tensor, q: Tensor, x: Tensor, *measured: Tensor) -> Tensor:
         """In the order of `order`."""

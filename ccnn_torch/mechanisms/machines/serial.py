@@ -145,8 +145,7 @@ class SerialArm(Mechanism):
         if orientation != "rotation_vector" and tool_offset is not None:
             tool = (0.0,) * 6 if isinstance(tool_offset, str) else (*tool_offset, 0.0, 0.0, 0.0)
             unknown = unknown - {"tool"} | ({"tool"} if isinstance(tool_offset, str) else set())
-        n = len(links)
-        types = tuple(joint_types or ["revolute"] * n)
+        n, types = len(links), tuple(joint_types or ["revolute"] * len(links))
         self._transform, _, _, self._axis_before = LINKS[convention]
         pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
         shown = {c for c, _ in pose}
