@@ -333,6 +333,7 @@ def _unit(unit: str, axis: Facts) -> tuple[str, float]:
     known = {
         "joint": (axis.unit, 1.0),
         "speed": (f"{axis.unit}/s", 1.0),
+        "acceleration": (f"{axis.unit}/s^2", 1.0),
         "torque": (force if axis.gain else axis.unit, gain),
         "inertia": ("kg*m^2" if axis.unit == "rad" else "kg", gain) if axis.gain else ("s^2", 1.0),
         "viscous": (f"{force}*s/{axis.unit}", gain) if axis.gain else ("s", 1.0),
