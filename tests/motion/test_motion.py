@@ -25,6 +25,8 @@ from ccnn_torch.motion import (
     write_identified,
 )
 from ccnn_torch.motion.effects import motion_effects
+from ccnn_torch.motion.judge import judge_axes, no_worse
+from ccnn_torch.motion.search import search
 from ccnn_torch.motion.servo import axis_keys
 from ccnn_torch.motion.setting import problem_of
 from ccnn_torch.records import read_table
@@ -90,6 +92,18 @@ def test_rounding_decides_no_verdict_on_a_real_servo() -> None:
     assert first["verdict"]["effects"] == second["verdict"]["effects"] != []
     assert first["verdict"]["probability"] == pytest.approx(second["verdict"]["probability"], abs=1e-4)
     assert first["gap"]["after"] == pytest.approx(second["gap"]["after"], rel=1e-4)
+
+
+def test_nothing_is_named_that_makes_runs_worse_which_it_was_not_fitted_to(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, delay=0.03)
+    problem = problem_of(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), motion_effects(["delay"]))
+    found = search(problem)
+    verdicts = judge_axes(found)
+    assert [found.problem.library.names[m] for m in verdicts[0].best.members] == ["delay"]
+    before = problem.residual(torch.zeros(1, problem.library.size, dtype=torch.float64), problem.axes)
+    assert no_worse(found, verdicts, before, 0.99 * before) == (verdicts, [])
+    kept, worse = no_worse(found, verdicts, before, 1.01 * before)
+    assert worse == [0] and kept[0].best.members == () and kept[0].probability <= 0.5
 
 
 def test_a_mechanism_file_gives_joints_that_follow_their_commands(tmp_path: Path) -> None:
