@@ -223,6 +223,12 @@ _WORDS = {
         "",
         "Speed limit and trajectory settings of {where}, and the supply voltage.",
     ),
+    "acceleration_limit": Words(
+        "a limit of the set point's acceleration",
+        "acceleration limit",
+        "The largest acceleration of the set point that the drive makes of the commands.",
+        "Profile acceleration, ramp or trajectory settings of {where}.",
+    ),
     "dead_band": Words(
         "a dead band of the position control",
         "dead band",

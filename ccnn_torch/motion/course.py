@@ -77,16 +77,32 @@ def course(
 
 @compilable
 def _limited(axis: Axis, step: Array, u: Array, q: Array, v: Array, push: Array) -> Array:
-    """Commands that change no faster than the drive allows, and may be behind already where they begin: there an axis
-    moves as it does at its start, but for its friction and inertia."""
+    """Commands whose speed, or whose acceleration, the drive limits, and that may be behind already where they begin:
+    there an axis moves as it does at its start, but for its friction and inertia.
+
+    With a limited acceleration they take the speed at which they can still come to rest at the command, or beside it
+    where that moves.
+    """
     load = axis.weight * np.sin(q + axis.hang) + (axis.viscous - axis.damping) * v + push
-    slow, fastest = axis.slowness > 0, 1 / np.maximum(axis.slowness, TINY)
+    slow, ramped = (axis.slowness > 0) | (axis.ramp > 0), axis.ramp > 0
+    fastest, most = 1 / np.maximum(axis.slowness, TINY), 1 / np.maximum(axis.ramp, TINY)
     found = u.copy()
     found[0] = pick(slow, q + load / np.maximum(axis.gain, TINY), u[0])
+    # No faster than it could brake.
+    begin, reach = (u[1] - u[0]) / step[0], np.sqrt(2 * most * np.abs(u[0] - found[0]))
+    pace = begin + np.minimum(np.maximum(v - begin, -reach), reach)
     for k in range(len(step)):
-        reach = fastest * step[k]
-        limited = found[k] + np.minimum(np.maximum(u[k + 1] - found[k], -reach), reach)
-        found[k + 1] = pick(slow, limited, u[k + 1])
+        behind, gained, rate = u[k] - found[k], most * step[k], (u[k + 1] - u[k]) / step[k]
+        # From the speed at the end of this step it comes to rest just there.
+        room = np.square(0.5 * gained) + 2 * most * np.abs(behind) - gained * (pace - rate) * np.sign(behind)
+        braking = np.sqrt(np.maximum(room, 0.0)) - 0.5 * gained
+        asked = rate + np.sign(behind) * pick(
+            ramped, np.minimum(np.abs(behind) / step[k], braking), np.abs(behind) / step[k]
+        )
+        asked = np.minimum(np.maximum(asked, -fastest), fastest)
+        able = pick(ramped, np.minimum(np.maximum(asked, pace - gained), pace + gained), asked)
+        moved = step[k] * pick(able == asked, asked, 0.5 * (pace + able))
+        found[k + 1], pace = pick(slow, found[k] + moved, u[k + 1]), able
     return found
 
 

@@ -22,7 +22,7 @@ from ccnn_torch.motion.effects import Facts, Number, motion_effects
 from ccnn_torch.motion.effects.bodies import STANDARD_GRAVITY
 from ccnn_torch.motion.fit import ALONE, deviations
 from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
-from ccnn_torch.motion.judge import AxisVerdict, judge_axes
+from ccnn_torch.motion.judge import AxisVerdict, judge_axes, no_worse
 from ccnn_torch.motion.known import TIME, allowed_text, share_of
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.linearised import searched
@@ -119,23 +119,29 @@ def _diagnosed(
     nothing = problem.residual(torch.zeros(len(nominal.axes), problem.library.size, dtype=torch.float64), problem.axes)
     found = searched(problem, logs, nominal, lambda: problem_of(logs, nominal, candidates))
     problem = found.problem
-    verdicts = judge_axes(found)
+    judged = judge_axes(found)
     at_step("judging on held-out rows")
     library, data = problem.library, problem.data
-    alone, names = singles(found), in_order(problem, verdicts)
+    alone, names = singles(found), in_order(problem, judged)
     members = [library.names.index(name) for name in names]
-    steps = [[only(library, v.best.spec, members[:k]) for v in verdicts] for k in range(len(names) + 1)]
+    steps = [[only(library, v.best.spec, members[:k]) for v in judged] for k in range(len(names) + 1)]
     # Where an effect acts in one run alone the others do not tell its numbers.
-    folded = replace(problem, parted=any(v.best.once > ALONE for v in verdicts))
+    folded = replace(problem, parted=any(v.best.once > ALONE for v in judged))
     residuals = held_out(folded, found.whitening, [*steps, *alone.values()])
     # Of the model itself, also where it was linearised elsewhere.
     residuals[0] = nothing
+    verdicts, worse = no_worse(found, judged, nothing, residuals[len(names)])
+    residuals[: len(names) + 1, worse] = nothing[worse]
+    named = {m for v in verdicts for m in v.best.members}
+    kept = [0, *(k + 1 for k, m in enumerate(members) if m in named)]
+    names = [names[k - 1] for k in kept[1:]]
+    residuals = torch.cat([residuals[kept], residuals[len(steps) :]])
     floor = noise**2 * len(verdicts) if noise else _floor_of(problem, found, verdicts)
     drawn = draws(len(data.run), seed)
     gaps = [gap_of(problem, nothing, left, floor, noise is not None, drawn) for left in residuals]
     total, in_steps = gaps[len(names)], gaps[1 : len(names) + 1]
     drivers = list(dict.fromkeys(v.driver for v in verdicts if v.driver))
-    each = dict(zip(alone, gaps[len(steps) :], strict=True))
+    each = dict(zip(alone, gaps[len(kept) :], strict=True))
     every = _effects_of(problem, found, verdicts, each)
     at_step("next measurements")
     wanted, proposed = next_motions(found, verdicts)
@@ -155,7 +161,7 @@ def _diagnosed(
         joints=_joints_of(problem, verdicts, nothing, residuals[len(names)]),
         next_measurements=wanted,
         not_seen={n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
-        cautions=[*cautions, *_hidden_of(problem, verdicts)],
+        cautions=[*cautions, *_worse_of(library, judged, worse), *_hidden_of(problem, verdicts)],
         notes=_notes_of(folded, nominal, found, verdicts, total.floor, noise),
     )
     return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed, nominal)
@@ -240,6 +246,16 @@ def _joints_of(
             "gap_after": last,
         }
         for i, (v, first, last) in enumerate(zip(verdicts, *sizes, strict=True))
+    ]
+
+
+def _worse_of(library: Library, judged: Sequence[AxisVerdict], worse: Sequence[int]) -> list[str]:
+    """Cautions on joints of which nothing is named for that reason, a sentence each without a full stop."""
+    return [
+        f"q{i + 1}: {listed([words_of(library.names[m]).cause for m in judged[i].best.members])} fits the logs best, "
+        "but leaves more of runs not used for fitting than the model does, and is not named: the runs differ in what "
+        "they have"
+        for i in worse
     ]
 
 
@@ -333,6 +349,7 @@ def _unit(unit: str, axis: Facts) -> tuple[str, float]:
     known = {
         "joint": (axis.unit, 1.0),
         "speed": (f"{axis.unit}/s", 1.0),
+        "acceleration": (f"{axis.unit}/s^2", 1.0),
         "torque": (force if axis.gain else axis.unit, gain),
         "inertia": ("kg*m^2" if axis.unit == "rad" else "kg", gain) if axis.gain else ("s^2", 1.0),
         "viscous": (f"{force}*s/{axis.unit}", gain) if axis.gain else ("s", 1.0),

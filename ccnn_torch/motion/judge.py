@@ -85,6 +85,30 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
     return [v._replace(probability=min(v.probability, _UNCONFIRMED)) if v.doubted else v for v in verdicts]
 
 
+def no_worse(
+    found: Search, verdicts: Sequence[AxisVerdict], before: Tensor, after: Tensor
+) -> tuple[list[AxisVerdict], list[int]]:
+    """The verdicts, but nothing of axes of which what they name leaves more on runs that it was not fitted to.
+
+    Args:
+        found: the search.
+        verdicts: of each axis.
+        before, after: residuals of nothing, and held out those of the verdicts, `n x b x s`.
+
+    Returns:
+        the verdicts, and the axes of which they are other ones.
+    """
+    left, more = ((v.square() * found.problem.data.judged).sum((-1, -2)).tolist() for v in (before, after))
+    worse = [i for i, v in enumerate(verdicts) if v.best.members and more[i] > left[i]]
+    kept = list(verdicts)
+    for i in worse:
+        nothing = next(fit for fit in found.found[i] if not fit.members)
+        kept[i] = verdicts[i]._replace(
+            best=nothing, probability=min(verdicts[i].probability, _UNCONFIRMED), classes={}, hidden=None, doubted=False
+        )
+    return kept, worse
+
+
 def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     problem, fits = found.problem, found.found[axis]
     by_members = {f.members: f for f in fits}

@@ -22,8 +22,8 @@ from ccnn_torch.spelling import nearest
 
 # What may not be below 0, and what not above.
 _POSITIVE = (
-    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "play", "dead_band"),
-    *("flexibility", "gain", "integral", "derivative", "supply"),
+    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "ramp", "play"),
+    *("dead_band", "flexibility", "gain", "integral", "derivative", "supply"),
 )
 # With more damping a spring is no spring; a motor is no stronger than its voltage, but for an error of that.
 _MOST = {"load_friction": 0.9, "flexible_damping": 0.3, "supply": 1.5}
@@ -36,7 +36,7 @@ _REACH = 0.6
 # Plausible sizes: no number is larger.
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
-_RARER = {"stribeck": math.log(0.1), "cogging": math.log(0.1), "dead_band": math.log(0.1)}
+_RARER = dict.fromkeys(("stribeck", "cogging", "dead_band", "acceleration_limit"), math.log(0.1))
 _SMALLEST = 1e-6
 # Shapes that a fit refines from where they begin.
 _REFINED = ("cogging_order", "stribeck_speed", "flexible_damping", "play_friction")

@@ -229,12 +229,13 @@ class _Pool:
         """The most probable set without each of its members, and with another effect in the place of each."""
         for _ in range(3):
             before = self.best()
-            self.fit(self.screened(self.fewer([f.spec for f in before], _LONG)), _LONG)
+            self.fit(self.screened(self.fewer([f.spec for f in before], _SHORT)), _SHORT)
             # What does the same as a member needs the numbers that the others have beside that.
             pairs = [(i, without(self.library, f.spec, k)) for i, f in enumerate(before) for k in range(len(f.members))]
             less = fit_many(self.problem, self.whitening, pairs, 0, nuisance=self.nuisance)
             bases = [[fit for (j, _), fit in zip(pairs, less, strict=True) if j == i] for i in range(self.axes)]
-            self.fit(self.screened(bases, 1, [{f.members} for f in before]), _LONG)
+            self.fit(self.screened(bases, 1, [{f.members} for f in before]), _SHORT)
+            self.fit([[f.spec for f in self.leading(i)] for i in range(self.axes)], _LONG)
             if all(a.members == b.members for a, b in zip(before, self.best(), strict=True)):
                 return
 

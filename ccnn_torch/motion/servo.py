@@ -41,6 +41,7 @@ KEYS: dict[str, str] = {
     "backlash_loaded": "1 where the load moves freely within the play, and its weight presses it to one side [1]",
     "backlash_friction": "what friction of its own then brakes the load by [rad/s^2]",
     "speed_limit": "of the drive, beyond which it follows no command [rad/s]",
+    "acceleration_limit": "of the set point that the drive makes of the commands [rad/s^2]",
     "torque_limit": "of the motor, at the nominal supply [N*m]",
     "supply": "nominal voltage, at which gain and torque_limit hold; given, both go with the column supply[V] [V]",
     "supply_share": "how far they do: 1 where supply is given, 0 not at all [1]",
@@ -66,7 +67,8 @@ _SAME = {
     "supply_share": "supply",
 }
 
-
+# Limits, of which an axis has one over each.
+_INVERSE = {"speed_limit": "slowness", "acceleration_limit": "ramp"}
 # Share of an inertia below which a difference of two is none.
 _ROUNDING = 1e-9
 
@@ -105,8 +107,7 @@ def servo(keys: Mapping[str, Any], n: int) -> Nominal:
         axis |= {name: own[key] for key, name in _SAME.items() if key in own}
         if own.get("torque_limit"):
             axis["weakness"] = unit / own["torque_limit"]
-        if own.get("speed_limit"):
-            axis["slowness"] = 1 / own["speed_limit"]
+        axis |= {name: 1 / own[key] for key, name in _INVERSE.items() if own.get(key)}
         if own.get("supply"):
             axis.setdefault("supply", 1.0)
         axes.append({name: value for name, value in axis.items() if value})
@@ -137,7 +138,7 @@ def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequ
         own["load_inertia"] = min(behind, own["inertia"]) if behind > _ROUNDING * own["inertia"] else 0.0
         own |= {"gain": unit * axis.get("gain", 1.0), "mass": mass, "length": lever or 1.0}
         own |= {key: axis.get(name, ABSENT[name]) for key, name in _SAME.items()}
-        own["speed_limit"] = 1 / axis["slowness"] if axis.get("slowness") else 0.0
+        own |= {key: 1 / axis[name] if axis.get(name) else 0.0 for key, name in _INVERSE.items()}
         own["torque_limit"] = unit / axis["weakness"] if axis.get("weakness") else 0.0
         each.append(own)
     usual = {key: ABSENT.get(name, 0.0) for key, name in _SAME.items()}

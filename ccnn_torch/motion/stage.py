@@ -38,6 +38,7 @@ ABSENT: dict[str, float] = {
     "cogging_order": 1.0,
     "weakness": 0.0,
     "slowness": 0.0,
+    "ramp": 0.0,
     "delay": 0.0,
     "offset": 0.0,
     "dead_band": 0.0,
@@ -106,6 +107,7 @@ class Axis(NamedTuple):
     dead_band: Array
     delay: Array
     slowness: Array
+    ramp: Array
     derivative: Array
     damping: Array
     play: Array
@@ -221,6 +223,7 @@ def axis_of(a: Mapping[str, Array]) -> Axis:
         dead_band=a["dead_band"],
         delay=a["delay"],
         slowness=a["slowness"],
+        ramp=a["ramp"],
         derivative=a["derivative"],
         damping=damping,
         play=a["play"],
@@ -235,8 +238,8 @@ def each_has(axis: Axis) -> Has:
     dry = (axis.coulomb != 0) | (axis.load_friction != 0) | (axis.stribeck != 0)
     return Has(
         *(axis.integral != 0, dry, axis.load_friction != 0, axis.stribeck != 0, axis.weight != 0, axis.wave != 0),
-        *(axis.flexibility > 0, axis.limit < 1 / TINY, axis.slowness > 0, axis.derivative != 0, axis.dead_band > 0),
-        axis.play > 0,
+        *(axis.flexibility > 0, axis.limit < 1 / TINY, (axis.slowness > 0) | (axis.ramp > 0)),
+        *(axis.derivative != 0, axis.dead_band > 0, axis.play > 0),
         (axis.play > 0) & (axis.play_loaded > 0),
     )
 

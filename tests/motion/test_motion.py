@@ -25,6 +25,8 @@ from ccnn_torch.motion import (
     write_identified,
 )
 from ccnn_torch.motion.effects import motion_effects
+from ccnn_torch.motion.judge import judge_axes, no_worse
+from ccnn_torch.motion.search import search
 from ccnn_torch.motion.servo import axis_keys
 from ccnn_torch.motion.setting import problem_of
 from ccnn_torch.records import read_table
@@ -90,6 +92,18 @@ def test_rounding_decides_no_verdict_on_a_real_servo() -> None:
     assert first["verdict"]["effects"] == second["verdict"]["effects"] != []
     assert first["verdict"]["probability"] == pytest.approx(second["verdict"]["probability"], abs=1e-4)
     assert first["gap"]["after"] == pytest.approx(second["gap"]["after"], rel=1e-4)
+
+
+def test_nothing_is_named_that_makes_runs_worse_which_it_was_not_fitted_to(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, delay=0.03)
+    problem = problem_of(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), motion_effects(["delay"]))
+    found = search(problem)
+    verdicts = judge_axes(found)
+    assert [found.problem.library.names[m] for m in verdicts[0].best.members] == ["delay"]
+    before = problem.residual(torch.zeros(1, problem.library.size, dtype=torch.float64), problem.axes)
+    assert no_worse(found, verdicts, before, 0.99 * before) == (verdicts, [])
+    kept, worse = no_worse(found, verdicts, before, 1.01 * before)
+    assert worse == [0] and kept[0].best.members == () and kept[0].probability <= 0.5
 
 
 def test_a_mechanism_file_gives_joints_that_follow_their_commands(tmp_path: Path) -> None:
@@ -359,6 +373,29 @@ def test_a_dead_band_of_the_drive_is_named_and_is_no_friction(tmp_path: Path) ->
     assert found["verdict"]["effects"] == ["dead_band"] and found["verdict"]["probability"] > 0.9
     numbers = next(e for e in found["effects"] if e["name"] == "dead_band")["parameters"]
     assert numbers["q1 dead band"]["value"] == pytest.approx(0.02, rel=0.03)
+
+
+def test_a_limit_of_the_set_points_acceleration_is_named(tmp_path: Path) -> None:
+    # Steps, of which the drive makes as fast ones as it may: half the way faster and faster, then slower.
+    most, time, begin, generator = 6.0, np.arange(0, 5, 0.01), 0.0, np.random.default_rng(4)
+    asked, made = np.zeros_like(time), np.zeros_like(time)
+    for at, size in ((0.195, 0.5), (1.195, -0.9), (2.295, 0.3), (3.095, 0.7), (4.095, -0.6)):
+        half, since = np.sqrt(abs(size) / most), np.maximum(time - at, 0)
+        way = np.where(since < half, most * since**2 / 2, abs(size) - most * np.maximum(2 * half - since, 0) ** 2 / 2)
+        made += np.sign(size) * way
+        asked[time >= at] = begin = begin + size
+    q = moved(time, made) + 1e-4 * generator.standard_normal(len(time))
+    rows = np.stack([time, asked, q], -1)
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="time[s],command1[rad],q1[rad]", comments="")
+    tried = ["acceleration_limit", "speed_limit", "saturation", "inertia", "delay"]
+    nominal = nominal_of("servo", KEYS, ["rad"])
+    found = diagnose_motion(load_logs([tmp_path / "log.csv"]), nominal, tried).content
+    assert found["verdict"]["effects"] == ["acceleration_limit"] and found["verdict"]["probability"] > 0.9
+    number = next(e for e in found["effects"] if e["name"] == "acceleration_limit")["parameters"]["q1 acceleration"]
+    # Between which samples a step was made is not known.
+    assert number["value"] == pytest.approx(most, rel=0.05) and number["unit"] == "rad/s^2"
+    keys = axis_keys(nominal, [{"ramp": 1 / most}], [0.0])
+    assert keys["acceleration_limit"] == [pytest.approx(most)]
 
 
 def test_a_derivative_gain_is_told_in_seconds_over_the_proportional_one(tmp_path: Path) -> None:

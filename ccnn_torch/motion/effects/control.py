@@ -31,6 +31,11 @@ def _either_gain(axis: Facts) -> list[dict[str, float | None]]:
     return [*either, *({_PROPORTIONAL: None, _DERIVATIVE: v} for v in derivative)]
 
 
+def _usual(axis: Facts) -> float:
+    """The largest acceleration of a sine with the span and the speed of the axis."""
+    return 2 * axis.speed**2 / axis.span
+
+
 def _recorded(axis: Facts) -> bool:
     return axis.supply >= _LEAST_CHANGE
 
@@ -93,6 +98,13 @@ SPEED_LIMIT = MotionEffect(
     "speed_limit",
     lambda axis: (Number("speed", "speed", 2 / axis.speed, (add("slowness"),), inverse=True),),
     lambda axis: [{"speed": 1 / (share * axis.speed)} for share in (0.25, 0.5, 0.75, 0.9)],
+)
+
+# A limit of the acceleration of the set point (profile of a drive): as a sine that is nearly as fast as the motion.
+ACCELERATION_LIMIT = MotionEffect(
+    "acceleration_limit",
+    lambda axis: (Number("acceleration", "acceleration", 1 / _usual(axis), (add("ramp"),), inverse=True),),
+    lambda axis: [{"acceleration": 1 / (share * _usual(axis))} for share in (0.3, 1.0, 3.0, 10.0)],
 )
 
 # The motor's strength and its limit go with the voltage, damping and friction do not.

@@ -17,7 +17,7 @@ EFFECTS: dict[str, MotionEffect] = {
         *(control.DELAY, control.SERVO_GAIN, control.OFFSET, bodies.GRAVITY, bodies.PAYLOAD, bodies.INERTIA),
         *(friction.VISCOUS, friction.COULOMB, friction.STRIBECK, gears.BACKLASH, gears.FLEXIBLE_JOINT),
         *(control.SPEED_LIMIT, control.SATURATION, control.SUPPLY, gears.COGGING, friction.THERMAL_FRICTION),
-        *(control.INTEGRAL_ACTION, control.DEAD_BAND),
+        *(control.INTEGRAL_ACTION, control.DEAD_BAND, control.ACCELERATION_LIMIT),
     )
 }
 
