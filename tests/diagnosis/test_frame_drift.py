@@ -147,7 +147,7 @@ def test_what_follows_the_time_comes_before_a_joint_that_was_moved_with_it(tmp_p
 
 
 def test_commands_are_not_corrected_for_a_frame_that_moved(cli: Cli, tmp_path: Path) -> None:
-    arm = Arm(7, _settling, 160)
+    arm = Arm(7, _settling, 110)
     records, file = arm.write(tmp_path)
     words = ("--records", records, "--mechanism", file, "--out", str(tmp_path / "d"), "--no-network", "--quiet")
     assert cli("diagnose", *words)[0] == 0
