@@ -177,7 +177,14 @@ def test_a_run_from_the_command_line_and_its_files(cli: Cli, tmp_path: Path) -> 
 
 
 def test_a_killed_run_resumes_to_the_same(cli: Cli, played: Path, tmp_path: Path) -> None:
-    quick = ("methods=bp_lm", "save_report=false", "save_models=false", "--quiet")
+    quick = (
+        "methods=bp_lm",
+        "bp_lm.iterations=20",
+        "bp_lm.restarts=2",
+        "save_report=false",
+        "save_models=false",
+        "--quiet",
+    )
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert cli("run", played / "config.yaml", f"out={whole}", *quick)[0] == 0
     shutil.copytree(whole, cut)

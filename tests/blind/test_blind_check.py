@@ -36,7 +36,7 @@ def beside(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccnn_validation.blind.check._generator", lambda what, folder: sides[what](folder))
 
 
-def check(out: Path, diagnose: StandIn, cases: int = 9) -> Path:
+def check(out: Path, diagnose: StandIn, cases: int = 6) -> Path:
     return run_blind_check(cases, out, diagnose, seed=4, machines=("five_bar",), quiet=True)
 
 

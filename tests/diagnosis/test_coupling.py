@@ -29,13 +29,12 @@ tool_offset: [20, 0, 0]
 NOISE = 8e-6
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_screw_of_a_quill_is_named_beside_wrong_links_and_zeros(seed: int, tmp_path: Path) -> None:
+def test_the_screw_of_a_quill_is_named_beside_wrong_links_and_zeros(tmp_path: Path) -> None:
     """60 rows: the quill sinks 0.191 mm for each radian of the fourth joint; links and zeros are wrong as well."""
     (tmp_path / "scara.yaml").write_text(SCARA)
     arm = load_mechanism(str(tmp_path / "scara.yaml"), orientation="none")
     assert isinstance(arm, SerialArm)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     span = torch.tensor([[-2.0, 2.0], [-2.2, 2.2], [0.0, 0.15], [-3.0, 3.0]], dtype=torch.float64)
     joints = span[:, 0] + (span[:, 1] - span[:, 0]) * torch.rand(60, 4, generator=generator, dtype=torch.float64)
     truth, names = arm.nominal.clone(), [p.name for p in arm.geometry]

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ccnn_torch.diagnosis import diagnose_rows
+from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
 from ccnn_torch.diagnosis.from_records import named_machine, situation_of
 from ccnn_torch.diagnosis.page.outputs import write_corrected
 from ccnn_torch.diagnosis.residual.rows import frame_columns
@@ -101,21 +101,30 @@ def _in_sockets() -> tuple[Situation, Tensor]:
     return Situation(arm, joints, {}, default_gravity(arm), frames, pose), pose
 
 
-def test_an_error_of_the_geometry_is_named_where_the_device_shows_two_points_alone() -> None:
-    """The nominal place varies there by the gap alone: no scale of the device, and no rest, may go by it."""
+@pytest.fixture(scope="module")
+def sockets() -> tuple[Situation, Diagnosis]:
+    """Rows in sockets and what is found in them; down is as the first plate has it."""
     situation, pose = _in_sockets()
-    found = diagnose_rows(situation, pose)
+    assert situation.parameters is not None
+    down = rotation_vector_to_matrix(situation.parameters[0, 3:6]) @ situation.gravity
+    return situation, diagnose_rows(replace(situation, gravity=down), pose)
+
+
+def test_an_error_of_the_geometry_is_named_where_the_device_shows_two_points_alone(
+    sockets: tuple[Situation, Diagnosis],
+) -> None:
+    """The nominal place varies there by the gap alone: no scale of the device, and no rest, may go by it."""
+    found = sockets[1]
     assert found.verdict["effects"] == ["geometry"] and not found.verdict["outside_library"]
     assert found.gap["after"] < 0.1 * found.gap["before"]
 
 
-def test_the_machine_that_was_found_in_sockets_is_delivered_in_its_own_base() -> None:
+def test_the_machine_that_was_found_in_sockets_is_delivered_in_its_own_base(
+    sockets: tuple[Situation, Diagnosis],
+) -> None:
     """Plates stand anywhere; links and tool are the arm's, and put the ball where each socket holds it."""
-    situation, pose = _in_sockets()
-    assert situation.parameters is not None
-    # Down as the first plate has it.
-    down = rotation_vector_to_matrix(situation.parameters[0, 3:6]) @ situation.gravity
-    block = named_machine(diagnose_rows(replace(situation, gravity=down), pose))
+    situation, said = sockets
+    block = named_machine(said)
     assert block is not None
     found = machine_of_block(block, "diagnosis.json")
     arm = found.identified

@@ -90,22 +90,17 @@ def _touched(share: Array) -> Array:
 
 _CASES = [
     (_creeping, 2, True),
-    (_settling, None, False),
     (_touched, None, False),
-    (_touched, 2, True),
 ]
 
 
 def test_a_drift_of_the_frame_is_named_beside_geometry_with_its_numbers(tmp_path: Path) -> None:
-    right = 0
     for seed, (way, sort, timed) in enumerate(_CASES):
         arm = Arm(seed, way, sort=sort)
         records, file = arm.write(tmp_path, timed)
         mechanism = load_mechanism(file)
         said = diagnose(load_records(records, mechanism), mechanism)
-        if set(said.verdict["effects"]) != {"geometry", "frame_drift"} or said.verdict["outside_library"]:
-            continue
-        right += 1
+        assert set(said.verdict["effects"]) == {"geometry", "frame_drift"} and not said.verdict["outside_library"]
         assert said.verdict["probability"] > 0.9 if timed else bool(said.inferred)
         found = next(e for e in said.content["effects"] if e["name"] == "frame_drift")["parameters"]
         turn = [found[name]["value"] for name in ("rx", "ry", "rz")]
@@ -118,7 +113,6 @@ def test_a_drift_of_the_frame_is_named_beside_geometry_with_its_numbers(tmp_path
             assert found["settling"]["value"] < moments[2]
             text = next(f.text for f in findings(said.content) if f.effect == "frame_drift")
             assert "after the first row on" in text if timed else abs(_row_of(text) - (first + 1)) <= 1
-    assert right >= len(_CASES) - 1
 
 
 def test_a_frame_that_drifts_is_named_on_a_parallel_machine() -> None:
@@ -153,7 +147,7 @@ def test_what_follows_the_time_comes_before_a_joint_that_was_moved_with_it(tmp_p
 
 
 def test_commands_are_not_corrected_for_a_frame_that_moved(cli: Cli, tmp_path: Path) -> None:
-    arm = Arm(7, _settling, 160)
+    arm = Arm(7, _settling, 110)
     records, file = arm.write(tmp_path)
     words = ("--records", records, "--mechanism", file, "--out", str(tmp_path / "d"), "--no-network", "--quiet")
     assert cli("diagnose", *words)[0] == 0

@@ -12,7 +12,7 @@ from ccnn_torch.effects import EFFECTS
 @pytest.mark.parametrize(
     ("machine", "cause", "size", "driver"),
     [
-        ("stewart", "instrument", 30.0, "workspace"),
+        ("delta", "instrument", 30.0, "workspace"),
         ("stewart", "frame", 30.0, "workspace"),
         ("tripod", "tool", 30.0, "workspace"),
         ("delta", "joint_gain", 10.0, "joint"),

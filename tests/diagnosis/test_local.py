@@ -54,7 +54,7 @@ def test_waves_of_several_joints_are_no_other_effect() -> None:
     assert said["outside_library"] and said["driver"].startswith("joint") and not said["effects"]
 
 
-@pytest.mark.parametrize(("machine", "periods"), [("five_bar", 18.7), ("stewart", 11.3)])
+@pytest.mark.parametrize(("machine", "periods"), [("five_bar", 18.7), ("tripod", 11.3)])
 def test_a_quick_sway_follows_the_time_and_is_no_noise(machine: str, periods: float) -> None:
     situation = rows_of(machine, 150, 20)
     time = situation.covariates["time"]

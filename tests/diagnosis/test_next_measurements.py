@@ -131,7 +131,7 @@ def test_conditions_that_always_came_together_come_apart() -> None:
     rows = rows_of("five_bar", 60, 5)
     side = rows.covariates["direction1"]
     tied = replace(rows, covariates={**rows.covariates, "load_x": 50 * (1 + side), "direction2": side})
-    said = diagnose_rows(tied, measured(tied, {"backlash": 6.0}, 6))
+    said = diagnose_rows(tied, measured(tied, {"backlash": 6.0}, 6), effects=["backlash", "compliance"])
     there = _candidates(said.analysis, 0)
     assert torch.equal(there.covariates["direction1"], there.covariates["direction2"])
     loaded, back = there.covariates["load_x"] > 0, there.covariates["direction1"] > 0

@@ -25,16 +25,15 @@ def measured(situation: Situation, change: Tensor, times: float, seed: int) -> T
     return still + moved + NOISE * drawn
 
 
-@pytest.mark.parametrize("joint", [0, 1])
-def test_a_jump_of_a_joint_is_named_with_its_row(joint: int) -> None:
-    situation = rows_of("five_bar", 200, 30 + joint)
+def test_a_jump_of_a_joint_is_named_with_its_row() -> None:
+    situation = rows_of("five_bar", 200, 31)
     change = torch.zeros_like(situation.joints)
-    change[120:, joint] = 1
+    change[120:, 1] = 1
     found = diagnose_rows(situation, measured(situation, change, 10, 1))
     assert found.verdict["outside_library"] and found.verdict["driver"] == "time" and not found.verdict["effects"]
     note = next(note for note in found.notes if "jump" in note)
     first = int(note.split("row ")[1].split()[0])
-    assert f"a jump of joint q{joint + 1}" in note and abs(first - 121) <= 1
+    assert "a jump of joint q2" in note and abs(first - 121) <= 1
 
 
 def test_a_product_of_two_drivers_names_both() -> None:

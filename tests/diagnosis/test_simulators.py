@@ -107,7 +107,9 @@ def test_the_commands_take_it_and_simulate_its_parameters(cli: Cli, tmp_path: Pa
     assert code == 0, told
     assert "parameter spring1" in shown and "payload[kg]" in (tmp_path / "r.csv").read_text(encoding="utf-8")
     of = ("--records", tmp_path / "r.csv", "--mechanism", PRESS)
-    code, shown, told = cli("diagnose", *of, "--out", tmp_path / "d", "--effects", "parameter_spring1,compliance")
+    code, shown, told = cli(
+        "diagnose", *of, "--no-network", "--out", tmp_path / "d", "--effects", "parameter_spring1,compliance"
+    )
     assert code == 0, told
     verdict = json.loads((tmp_path / "d" / "diagnosis.json").read_text(encoding="utf-8"))["verdict"]
     assert verdict["effects"] == ["parameter spring1"] and "parameter spring1" in shown

@@ -28,7 +28,7 @@ def test_zeros_are_told_as_they_have_to_be_written(tmp_path: Path, orientation: 
     model = tmp_path / "arm.yaml"
     model.write_text(arm_text())
     arm, rng = load_mechanism(str(model)), np.random.default_rng(3)
-    shown = rng.uniform(-2, 2, (40, 6))
+    shown = rng.uniform(-2, 2, (24, 6))
     pose = arm.forward_kinematics(torch.from_numpy(shown * [1, -1, 1, 1, 1, 1] + ZEROS)).numpy()
     channels = 6 if orientation else 3
     names = ["x[m]", "y[m]", "z[m]", "rx[rad]", "ry[rad]", "rz[rad]"][:channels]
@@ -47,6 +47,6 @@ def test_a_model_of_another_arm_is_refused_without_zeros(tmp_path: Path) -> None
     model.write_text(arm_text())
     arm, rng = load_mechanism(str(model)), np.random.default_rng(4)
     names = ["x[m]", "y[m]", "z[m]", "rx[rad]", "ry[rad]", "rz[rad]"]
-    path = _rows(tmp_path, names, rng.uniform(-2, 2, (40, 6)), rng.uniform(-1, 1, (40, 6)))
+    path = _rows(tmp_path, names, rng.uniform(-2, 2, (24, 6)), rng.uniform(-1, 1, (24, 6)))
     with pytest.raises(InputError, match="check the units"):
         diagnose(load_records(path, arm), arm)

@@ -44,9 +44,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """A kill takes three processes: tests/test_run.py has some in the ordinary run, these are there on demand."""
+    """These take processes: tests/test_run.py and tests/test_files.py have some in the ordinary run."""
     if config.getoption("--fuzz-cases") is None:
-        items[:] = [item for item in items if item.name != "test_a_kill_at_any_moment"]
+        items[:] = [item for item in items if item.name not in ("test_a_kill_at_any_moment", "test_a_full_disk")]
 
 
 def rows_of(name: str, folder: Path, rows: int, noise: float = 1e-5) -> list[list[str]]:

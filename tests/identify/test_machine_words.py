@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from ccnn_torch.compensation import load_compensation
@@ -41,9 +40,8 @@ def _gantry(folder: Path, seed: int) -> dict[str, float]:
     return numbers
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_gantry_has_squareness_and_leads(seed: int, tmp_path: Path, cli: Cli) -> None:
-    numbers = _gantry(tmp_path, seed)
+def test_a_gantry_has_squareness_and_leads(tmp_path: Path, cli: Cli) -> None:
+    numbers = _gantry(tmp_path, 0)
     out = tmp_path / "found"
     words = (f"records={tmp_path / 'gantry.csv'}", f"mechanism={tmp_path / 'gantry.yaml'}", "save_report=false")
     code, screen, _ = cli("identify", *words, "--details", "--out", out)
