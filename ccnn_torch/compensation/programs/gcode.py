@@ -94,6 +94,9 @@ class GCode:
             )
 
     def _block(self, shown: str, line: int, place: int, state: _State) -> None:
+        if re.fullmatch(r"\s*O\s*\d+\s*", shown, re.IGNORECASE):
+            # The number of a program; words after it would make it a loop or a call.
+            return
         if re.match(r"\s*[oO]\s*[<\d]", shown) or re.search(rf"[{_AXES}IJK]\s*[\[#=]", shown, re.IGNORECASE):
             raise InputError(
                 f"line {line}: has a position that is computed, or a loop; give a program with the numbers themselves"
