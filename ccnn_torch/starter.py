@@ -316,7 +316,9 @@ def _machine(
     why = "given"
     if given is None:
         fitting = suitable_mechanisms(found, table)
-        if len(fitting) == 1:
+        # Joints of which no unit is told may be those of an arm as well.
+        bare = any(not table.units[name] for name, ours in found.meaning.items() if re.fullmatch(r"q\d+", ours))
+        if len(fitting) == 1 and not (bare and found.pose >= _POSITION):
             given, why = fitting[0], "the built-in one with just these joints and this pose"
         elif ask is not None:
             choices = f" (these fit: {', '.join(fitting)})" if fitting else ""

@@ -18,6 +18,22 @@ from ccnn_torch.files.yaml_file import read_yaml
 _STEPS = 5
 
 
+def _check_config(config: Path, records: Path) -> None:
+    """Raise InputError where the config that was written is of a log, or has no mechanism."""
+    keys = read_yaml(config)
+    if "motion" in keys:
+        raise InputError(
+            f"{records}: is a log of a motion, and the steps here are of poses; ccnn diagnose --config {config} reads "
+            "the log"
+        )
+    if "mechanism" not in keys:
+        config.unlink()
+        raise InputError(
+            f"--mechanism: is missing, and the columns of {records} do not tell it; give its name or file ({config} "
+            "was taken away again)"
+        )
+
+
 def start(
     records: Annotated[Path | None, typer.Argument(metavar="RECORDS.csv", help="Measured rows, with headers.")] = None,
     overrides: Overrides = None,
@@ -73,11 +89,7 @@ def start(
             raise InputError(f"{config} is not there yet; name RECORDS.csv to begin")
         make_folder(out)
         new(records, config, mechanism, units, quiet=quiet)
-        if "mechanism" not in read_yaml(config):
-            config.unlink()
-            raise InputError(
-                f"--mechanism: no built-in machine is the only one with the columns of {records}; give its name or file"
-            )
+        _check_config(config, records)
     if due(2, out / "check.json", "see what these rows can show (ccnn check)"):
         check(config=config, out=str(out), quiet=quiet)
     if due(3, diagnosis / "report.html", "find the cause of the error (ccnn diagnose)"):

@@ -79,7 +79,9 @@ class Coupling(Effect):
     description = "one joint's motion that moves another, as in a wrist's gears or a belt over several axes"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """A second joint."""
+        """A second joint; where sliding axes have a squareness, which is the same, one that turns."""
+        if all(j.unit == "m" for j in mechanism.joints) and any("squareness" in p.word for p in mechanism.geometry):
+            return "a joint that turns: between axes that slide a coupling is their squareness"
         return "" if len(mechanism.joints) > 1 else "a second joint: a single one has nothing to be coupled to"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:

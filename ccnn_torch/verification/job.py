@@ -254,7 +254,8 @@ def fit_motion(mechanism: Mechanism, expected: Tensor, measured: Tensor) -> Moti
     return Motion(rigid_body_frame(mechanism.frame(expected), mechanism.frame(measured), weights, ROTATION_WEIGHT))
 
 
-# A moved measuring frame is suspected if correcting it halves the remaining RMS error at least.
+# A moved measuring frame is suspected if correcting it halves the remaining RMS error at least, and leaves no more than
+# was promised.
 _SUSPECT = 0.5
 
 
@@ -359,7 +360,8 @@ def _moved(rows: Rows, results: VerifyResults) -> list[str]:
     at = rows.nominal if results.compensated else rows.predicted
     motion = fit_motion(rows.mechanism, at, rows.pose)
     left = rms_of(rows.mechanism.pose_error(rows.undone(motion), at).position)
-    if left is None or left > _SUSPECT * results.position.after.rms:
+    promised = results.position.promised
+    if left is None or left > _SUSPECT * results.position.after.rms or (promised and left > promised.high):
         return []
     return [
         f"The measuring device seems to have moved since the model was made: a rigid motion of its frame by "

@@ -30,6 +30,7 @@ Cli = Callable[..., tuple[int, str, str]]
 
 # In the form of https://linuxcnc.org/docs/html/gcode/g-code.html: modal words, comments, both ways to count.
 NC = b"""%\r
+O0017 (POCKET)\r
 (M\xfcnster, part 7) G21 G90 G54\r
 N10 G0 Z150.\r
 N20 G00 X100 Y200.5 F3000 ; not G1 X999\r
@@ -96,7 +97,7 @@ def test_g_code_reaches_its_positions_and_keeps_every_other_byte(tmp_path: Path,
     model = gantry(tmp_path)
     code, screen, err = cli("compensate", model, tmp_path / "part.nc", tmp_path / "out.nc")
     # Two moves are made before all axes are known.
-    assert code == 2 and "2 of 9 positions" in err and "X, Y is not known yet: lines 3, 14" in err.replace("\n", " ")
+    assert code == 2 and "2 of 9 positions" in err and "X, Y is not known yet: lines 4, 15" in err.replace("\n", " ")
     assert "7 of 9 positions corrected, by 0." in screen and "words of axes were added" in screen
     assert "1 lines begin with a word of letters" in screen
     found = (tmp_path / "out.nc").read_bytes().decode("latin-1")

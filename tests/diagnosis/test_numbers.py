@@ -16,6 +16,7 @@ from ccnn_torch.diagnosis import Diagnosis
 from ccnn_torch.diagnosis.page.data import About
 from ccnn_torch.diagnosis.page.first_screen import first_screen, numbers_table, where_words
 from ccnn_torch.mechanisms import SerialArm
+from ccnn_torch.mechanisms.kinds.machine_file import template
 from ccnn_torch.records import write_table
 from ccnn_torch.report.json_files import plain
 
@@ -126,3 +127,19 @@ def test_a_share_of_the_gap_is_compared_with_that_of_the_rows(rows: list[int], s
     }
     assert "; ".join(where_words(results, About()))[: len(said)] == said
     assert bool(where_words(results, About())) == bool(said)
+
+
+@pytest.mark.parametrize("base", ["identity", "unknown"])
+def test_axes_of_a_gantry_that_are_not_square_are_no_coupling(tmp_path, base):
+    (tmp_path / "gantry.yaml").write_text(template("gantry").replace("base_frame: unknown", f"base_frame: {base}"))
+    draw = np.random.default_rng(4)
+    commands = draw.uniform([0.05, 0.05, 0.02], [0.95, 0.75, 0.28], (70, 3))
+    # y leans towards x by 300 um/m; formulas of this test.
+    place = commands + np.outer(commands[:, 1], [3e-4, 0, 0]) + draw.normal(0, 5e-6, (70, 3))
+    columns = {f"q{k + 1}[m]": commands[:, k] for k in range(3)}
+    write_table(tmp_path / "r.csv", columns | {f"{axis}[m]": place[:, k] for k, axis in enumerate("xyz")})
+    machine = load_mechanism(str(tmp_path / "gantry.yaml"))
+    said = diagnose(load_records(tmp_path / "r.csv", machine), machine)
+    assert said.verdict["effects"] == ["geometry"], said.verdict["text"]
+    (entry,) = (e for e in said.to_json()["effects"] if e["name"] == "geometry")
+    assert entry["parameters"]["squareness_xy"]["value"] == pytest.approx(3e-4, abs=4e-5)

@@ -192,8 +192,8 @@ def machine_plot(arrays: Mapping[str, Array], effects: Sequence[str]) -> Plot | 
     lines = {name.removeprefix(_LINES): value for name, value in arrays.items() if name.startswith(_LINES)}
     everything = np.concatenate([*lines.values(), place])
     shapes = [np.ptp(values[:, plane[1]]) / np.ptp(values[:, plane[0]]) for values in (everything, place)]
-    height = 1.2 + 2.8 * float(np.clip(max(shapes), 0.4, 1.3))
-    figure = Figure(figsize=(10.2 if lines else 7.6, height), layout="constrained")
+    inches = (10.2 if lines else 7.6, 1.2 + 2.8 * float(np.clip(max(shapes), 0.4, 1.3)))
+    figure = Figure(figsize=inches, layout="constrained")
     panels = list(figure.subplots(1, 3 if lines else 2, squeeze=False)[0])
     if lines:
         _draw_machine(panels.pop(0), lines, place, plane)
