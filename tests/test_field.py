@@ -104,6 +104,21 @@ def test_splits_are_of_the_seed_and_hold_out_whole_groups(folder: Path) -> None:
     }
 
 
+def test_nights_are_trained_on_one_by_one(folder: Path) -> None:
+    data = own(folder)
+    night = np.arange(60) % 3
+    nights = replace(data, source=replace(data.source, night=True), group=night, rows=replace(data.rows, frame=night))
+    found = splits(nights)
+    (trained,) = np.unique(night[found["day"][0]])
+    assert len(found["day"][0]) == 20 and set(night[found["day"][1]]) == {0, 1, 2} - {trained}
+    for name in ("random", "block", "target"):
+        assert {*night[found[name][0]], *night[found[name][1]]} == {trained}
+    # The other nights' frames moved: they are judged where each stands.
+    away = nights.rows.poses + 0.1 * (night != trained)[:, None]
+    moved_on = replace(nights, rows=replace(nights.rows, poses=away))
+    assert score(moved_on, ENTRIES["scipy_geometry"], "day")["position"] < 6 * NOISE
+
+
 def test_a_motion_is_found_from_positions_alone_and_with_rotations() -> None:
     draw = np.random.default_rng(0)
     poses = draw.normal(0, 0.4, (9, 6))

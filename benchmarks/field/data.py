@@ -190,7 +190,7 @@ def _data(source: Source, columns: dict[str, Floats], arm: Arm, nominal: Path, p
         joints=np.stack([columns[n] for n in joints], 1),
         poses=np.stack([columns[n] for n in pose], 1),
         covariates=np.stack([columns[n] for n in names], 1) if names else np.zeros((count, 0)),
-        frame=np.zeros(count, np.int64) if source.night else group,
+        frame=group,
         names=names,
         arm=arm,
         nominal=nominal,

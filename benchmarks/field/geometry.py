@@ -75,7 +75,7 @@ def solve(rows: Rows, with_links: bool = True, residual: Callable[[Rows, Floats]
         start[-3:] = _tool_rotation(rows)
     links, tool = parts(least_squares(missed, start, method="lm" if with_links else "trf", x_scale="jac").x)
     found = Solved(rows.arm, links, tool, (np.eye(3), np.zeros(3)))
-    return found if rows.frame.max() > 0 else replace(found, base=rigid(found.in_base(rows.joints), rows.poses))
+    return found if rows.several else replace(found, base=rigid(found.in_base(rows.joints), rows.poses))
 
 
 def in_frames(rows: Rows, poses: Floats) -> Floats:

@@ -33,7 +33,7 @@ def write(rows: Rows, path: Path) -> str:
     names = ("x[m]", "y[m]", "z[m]", "rx[rad]", "ry[rad]", "rz[rad]")
     columns |= dict(zip(names, rows.poses.T, strict=False))
     columns |= {f"{n}[{_UNIT[n[0]]}]": c for n, c in zip(rows.names, rows.covariates.T, strict=True)}
-    if rows.frame.max() > 0:
+    if rows.several:
         columns["placement[1]"] = rows.frame.astype(np.float64)
     if rows.sockets:
         columns["socket[1]"] = np.unique(rows.poses, axis=0, return_inverse=True)[1].reshape(-1).astype(np.float64)
@@ -51,7 +51,7 @@ def machine_file(rows: Rows, folder: Path) -> str:
 
 def ours(rows: Rows) -> Fit:
     """The best of geometry, effects and network by cross-validation on the training rows."""
-    if rows.frame.max() > 0 and not rows.sockets:
+    if rows.several and not rows.sockets:
         raise InputError("a model file of ours holds one measuring frame; rows of several are for ccnn identify")
     with tempfile.TemporaryDirectory() as folder:
         file, nominal = write(rows, Path(folder) / "rows.csv"), machine_file(rows, Path(folder))

@@ -44,8 +44,8 @@ def markdown(cells: Sequence[Found], sets: Mapping[str, Source], about: Mapping[
     ]
     lines = [
         f"At most {TRAINING} training rows, {100 * HELD_OUT:.0f} % held out, seed {SEED}. Of the telescope a µm is a "
-        "µrad. The lowest error of a row is bold. Where a plate of sockets stands in several places, a rigid motion "
-        "for each is fitted to the held-out rows, of all entries alike."
+        "µrad. The lowest error of a row is bold. Of sockets and of another day a rigid motion of the measuring frame "
+        "is fitted to the held-out rows, of all entries alike."
     ]
     for title, show in tables:
         shown = {key: {e: show(key[1], f) for e, f in found.items()} for key, found in by_task.items()}

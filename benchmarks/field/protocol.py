@@ -56,6 +56,11 @@ class Rows:
         """The rows of an index."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)[:4]})
 
+    @property
+    def several(self) -> bool:
+        """Whether there is more than one measuring frame."""
+        return len(np.unique(self.frame)) > 1
+
     def with_values(self, **values: Any) -> Rows:
         return replace(self, **values)
 

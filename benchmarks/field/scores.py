@@ -37,15 +37,14 @@ def score(data: Data, entry: Entry, task: str) -> dict[str, Any]:
         if task == REPLICATES:
             found = replicates([entry.fit(data.rows.take(half)) for half in halves(train)], held)
         else:
-            found = held_out(entry.fit(data.rows.take(train)), held, data.floor)
+            fit, elsewhere = entry.fit(data.rows.take(train)), data.rows.take(np.concatenate([train, test])).several
+            found = held_out(fit, held, data.floor, elsewhere)
         found |= {"training_rows": len(train), "held_out_rows": len(test)}
     return found | {"seconds": time.perf_counter() - start}
 
 
 def aligned(rows: Rows, poses: Floats, target: Floats) -> Floats:
-    """Poses after a rigid motion for each measuring frame, where there are several, `n x p`."""
-    if rows.frame.max() == 0:
-        return poses
+    """Poses after a rigid motion for each measuring frame, `n x p`."""
     found = poses.copy()
     for one in np.unique(rows.frame):
         at = rows.frame == one
@@ -53,23 +52,29 @@ def aligned(rows: Rows, poses: Floats, target: Floats) -> Floats:
     return found
 
 
-def held_out(fit: Fit, rows: Rows, floor: float | None) -> dict[str, Any]:
-    """RMS of position and orientation, over the floor where it is known, and coverage of intervals."""
+def held_out(fit: Fit, rows: Rows, floor: float | None, elsewhere: bool) -> dict[str, Any]:
+    """RMS of position and orientation, over the floor where it is known, and coverage of intervals.
+
+    Args:
+        elsewhere: not all rows, training rows too, are of one measuring frame.
+    """
     poses = fit.predict(rows.joints, rows.covariates)
-    gaps = errors(rows.poses, aligned(rows, poses, rows.poses))
+    gaps = errors(rows.poses, aligned(rows, poses, rows.poses) if elsewhere else poses)
     found: dict[str, Any] = {"position": rms(gaps[:, :3]), "largest": float(np.linalg.norm(gaps[:, :3], axis=1).max())}
     if gaps.shape[1] == 6:
         found["rotation"] = rms(gaps[:, 3:])
     if floor is not None:
         found["over_floor"] = found["position"] / floor
-    if fit.half_width is not None and rows.frame.max() == 0:
+    if fit.half_width is not None and not elsewhere:
         found["coverage"] = float((np.abs(gaps) <= fit.half_width(rows.joints, rows.covariates)).mean())
     return found
 
 
 def replicates(fits: list[Fit], rows: Rows) -> dict[str, Any]:
     """RMS by which two fits to two halves differ on the held-out rows."""
-    one, other = (aligned(rows, f.predict(rows.joints, rows.covariates), rows.poses) for f in fits)
+    one, other = (f.predict(rows.joints, rows.covariates) for f in fits)
+    if rows.several:
+        one, other = (aligned(rows, poses, rows.poses) for poses in (one, other))
     return {"position": rms(errors(one, other)[:, :3])}
 
 

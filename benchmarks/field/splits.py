@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.field.data import Data
 from benchmarks.field.protocol import Ints
@@ -12,6 +13,7 @@ HELD_OUT = 0.3
 # More training rows are thinned to these, by the seed, so that the whole run stays below a quarter of an hour.
 TRAINING = 300
 Split = tuple[Ints, Ints]
+Mask = NDArray[np.bool_]
 
 
 def splits(data: Data, seed: int = SEED) -> dict[str, Split]:
@@ -20,24 +22,29 @@ def splits(data: Data, seed: int = SEED) -> dict[str, Split]:
     `random` rows; whole `target` places; the far `block` of the workspace, along the first principal direction of the
     positions; another `placement` of the measuring frame or another `day`; the authors' own `published` test rows.
     """
-    count, rows = len(data.rows.joints), data.rows
-    found = {"random": _held(np.arange(count), seed)}
+    count, rows, group = len(data.rows.joints), data.rows, data.group
+    drawn = group == np.random.default_rng(seed).integers(group.max() + 1)
+    # Each night has zeros of its own: one night is trained on.
+    usable = drawn if data.source.night else np.ones(count, np.bool_)
+    found = {"random": _held(np.arange(count), usable, seed)}
     if data.target is not None:
-        found["target"] = _held(data.target, seed)
+        found["target"] = _held(data.target, usable, seed)
     if not rows.sockets:
         centred = rows.poses[:, :3] - rows.poses[:, :3].mean(0)
         along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
-        found["block"] = along > np.quantile(along, 1 - HELD_OUT)
-    if data.group.max() > 0:
-        other = np.random.default_rng(seed).integers(data.group.max() + 1)
-        found["day" if data.source.night else "placement"] = data.group == other
+        found["block"] = along > np.quantile(along[usable], 1 - HELD_OUT)
     if data.published is not None and 0 < data.published.sum() < count:
         found["published"] = data.published == 1
-    return {name: (thinned(np.flatnonzero(~out), seed), np.flatnonzero(out)) for name, out in found.items()}
+    masks = {name: (usable & ~out, usable & out) for name, out in found.items()}
+    if data.source.night:
+        masks["day"] = drawn, ~drawn
+    elif group.max() > 0:
+        masks["placement"] = ~drawn, drawn
+    return {name: (thinned(np.flatnonzero(a), seed), np.flatnonzero(b)) for name, (a, b) in masks.items()}
 
 
-def _held(group: Ints, seed: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    groups = np.unique(group)
+def _held(group: Ints, usable: Mask, seed: int) -> Mask:
+    groups = np.unique(group[usable])
     drawn = np.random.default_rng(seed).permutation(groups)[: round(HELD_OUT * len(groups))]
     return np.isin(group, drawn)
 
