@@ -67,9 +67,10 @@ def _table(
     used = [e for e in entries if any(row.get(e) for row in shown.values())]
     lines = ["| set | rows | " + " | ".join(f"`{e}`" for e in used) + " |", "| --- | --- |" + " ---: |" * len(used)]
     for key, row in shown.items():
-        places = {e: f["position"] for e, f in judged.get(key, {}).items() if "position" in f}
-        best = min(places, key=lambda e: places[e]) if len(places) > 1 else ""
-        texts = [f"**{row[e]}**" if e == best else row.get(e, "") or "–" for e in used]
+        # As printed, so that equal ones are alike.
+        places = {e: round(1e6 * f["position"]) for e, f in judged.get(key, {}).items() if "position" in f}
+        best = min(places.values()) if len(places) > 1 else None
+        texts = [f"**{row[e]}**" if e in places and places[e] == best else row.get(e, "") or "–" for e in used]
         lines.append(f"| {key[0]} | {key[1]} | " + " | ".join(texts) + " |")
     return lines
 
@@ -121,5 +122,5 @@ def draw(cells: Sequence[Found]) -> Figure:
     axes.set(xscale="log", xlabel="held-out position error, share of the nominal machine's (frames fitted)")
     axes.grid(axis="x", which="both", alpha=0.3)
     if entries:
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
+        figure.legend(loc="outside lower center", ncols=3)
     return figure

@@ -10,7 +10,7 @@ from benchmarks.field.protocol import Ints
 
 SEED = 20260
 HELD_OUT = 0.3
-# More training rows are thinned to these, by the seed, so that the whole run stays below a quarter of an hour.
+# More training rows are thinned to these, by the seed: as many as people measure, and what a run can take.
 TRAINING = 300
 Split = tuple[Ints, Ints]
 Mask = NDArray[np.bool_]
