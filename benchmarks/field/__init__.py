@@ -1,0 +1,1 @@
+"""A benchmark of calibration on measured robots, for any method: python -m benchmarks.field --data FOLDER."""
