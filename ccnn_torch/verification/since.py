@@ -32,7 +32,7 @@ from ccnn_torch.effects import (
     pose_residual,
 )
 from ccnn_torch.effects.columns import inside
-from ccnn_torch.effects.constant import Frame
+from ccnn_torch.effects.constant import PARAMETER, Frame
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.errors import InputError
 from ccnn_torch.evidence.beam import search
@@ -52,6 +52,8 @@ FEWEST = 4
 """Configurations from which a change is told."""
 # What is lost, moved or exchanged while a machine works; gear ratios, lengths and springs change ten times more rarely.
 _USUAL, _RARE = ("joint_offset", "frame", "tool"), math.log(0.1)
+# What every machine has that was identified.
+_OF_A_MACHINE = (*_USUAL, "joint_gain", "geometry")
 # A device that is so far from where it stood was set up anew: first order does not hold, and nobody calls it an error.
 _FAR = {"m": 0.02, "rad": 0.02}
 # The frames of an arm by the effect that moves them.
@@ -140,7 +142,7 @@ def what_changed(
             f"{loaded.path}: has {count_text(count, 'configuration')}; measure {FEWEST} or more, better ten, that are "
             "spread over the workspace"
         )
-    atoms = _atoms(rows.situation)
+    atoms = _atoms(rows.situation, _may_change(model, rows.situation.mechanism))
     x = [a.columns[:, rows.channels] * rows.scale[..., None] for a in atoms]
     y = rows.residual * rows.scale
     notes = list(loaded.missing)
@@ -221,10 +223,19 @@ def _moved(found: Rows) -> Motion:
     return motion if shift > _FAR["m"] or turn > _FAR["rad"] else Motion.none()
 
 
-def _atoms(situation: Situation) -> list[Atom]:
+def _may_change(model: LoadedModel, mechanism: Mechanism) -> list[str]:
+    """Effects that can have changed: what a machine without a network does not hold may have been there before."""
+    names = effect_names(mechanism)
+    if model.machine is None:
+        return names
+    held = {*_OF_A_MACHINE, *(acting.effect.name for acting in model.machine.acting)}
+    return [name for name in names if name in held or name.startswith(PARAMETER)]
+
+
+def _atoms(situation: Situation, names: Sequence[str]) -> list[Atom]:
     """Changes of single parts: an effect's numbers joint by joint or leg by leg where each belongs to one."""
     atoms = []
-    for name in effect_names(situation.mechanism):
+    for name in names:
         effect = make_effect(name, situation.mechanism)
         # A frame that was fitted when the model was made may have moved since.
         fitted = _FRAMES.get(name) in getattr(inside(situation.mechanism), "unknown_frames", ())

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ccnn_torch import since
+from ccnn_torch.effects.words import words_of
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.report.results.since import SinceResults
 
@@ -61,16 +62,22 @@ def judged(case: Case, said: SinceResults) -> dict[str, str]:
     """A line of the table: what was put in, what was told, and how good that is."""
     told = [one.name for one in said.changed]
     right = told == ([case.name] if case.name else [])
-    part = not right and len(told) == 1 and bool(case.name) and told[0].split()[-1] == case.name.split()[-1]
+    like = not right and len(told) == 1 and _words(case.name) in said.changed[0].instead
     number = said.changed[0].numbers[0] if right and case.size is not None else None
     off = "" if number is None or case.size is None else f"{(number.value - case.size) / number.sd:.2f}"
     return {
         "change": case.name or "nothing",
         "told": " and ".join(told) or "nothing",
-        "right": "yes" if right else "the joint" if part else "no",
+        "right": "yes" if right else "of its class" if like else "no",
         "probability": f"{said.probability:.3f}",
         "number off [sd]": off,
     }
+
+
+def _words(name: str) -> str:
+    """A change in the words of the verdict."""
+    effect, _, part = name.partition(" ")
+    return f"{words_of(effect).short} of {part}" if part else words_of(effect).short
 
 
 def main() -> None:
@@ -100,11 +107,11 @@ def main() -> None:
                 lines.append(judged(case, since(given.model, path)))
     for kind in dict.fromkeys(line["change"].split()[0] for line in lines):
         mine = [line for line in lines if line["change"].split()[0] == kind]
-        right = [sum(line["right"] == word for line in mine) for word in ("yes", "the joint")]
-        print(f"{kind}: right {right[0]} of {len(mine)}, {right[1]} in the joint alone")
+        right = [sum(line["right"] == word for line in mine) for word in ("yes", "of its class")]
+        print(f"{kind}: right {right[0]} of {len(mine)}, told as what rows do not tell from another name {right[1]}")
     sure = [line for line in lines if float(line["probability"]) >= SURE]
     off = [abs(float(line["number off [sd]"])) for line in lines if line["number off [sd]"]]
-    print(f"claims at {SURE} or more: right {sum(line['right'] == 'yes' for line in sure)} of {len(sure)}")
+    print(f"claims at {SURE} or more: right {sum(line['right'] != 'no' for line in sure)} of {len(sure)}")
     print(f"numbers within 1.96 standard deviations: {sum(v < 1.96 for v in off)} of {len(off)}")
     if given.out is not None:
         with given.out.open("w", newline="", encoding="utf-8") as stream:
