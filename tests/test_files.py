@@ -114,7 +114,7 @@ def test_a_diagnosis_on_a_full_disk_is_told(cli: Cli, tmp_path: Path) -> None:
     with full_disk(3000):
         code, shown, told = cli("diagnose", *words, "--out", tmp_path / "found", "--quiet")
     assert code == 2 and "diagnosis.json: cannot be written" in told and len(told.splitlines()) == 1
-    assert "Backlash explains it" in " ".join(shown.split())
+    assert "What is wrong: Backlash" in " ".join(shown.split())
 
 
 def test_curves_end_where_the_disk_is_full_and_the_run_goes_on(tmp_path: Path) -> None:

@@ -107,16 +107,16 @@ _WORDS = {
     "homing": Words(
         "a new zero of the joints after each pause",
         "new zero by session",
-        "The zero of each session between two pauses. The next one has another: commands are not corrected for it.",
+        "The zero of each session between two pauses.",
         "Homing of {where}: reference switch, index pulse or battery of the encoder. Home again, or measure the zero "
-        "at each start.",
+        "at each start: the next one has another, and commands are not corrected for it.",
     ),
     "frame_drift": Words(
         "a measuring frame that moves in time",
         "drift of the measuring frame",
-        "How far the frame is gone at the last row, about the middle of the workspace. It is none of the machine: "
-        "commands are not corrected for it.",
-        "The stand of the measuring device and the clamping of the base: what creeps, warms up or was touched.",
+        "How far the frame is gone at the last row, about the middle of the workspace.",
+        "The stand of the measuring device and the clamping of the base: what creeps, warms up or was touched. It is "
+        "none of the machine, and commands are not corrected for it.",
     ),
     "frame": Words(
         "a shifted or tilted base frame",

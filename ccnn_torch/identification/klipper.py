@@ -28,4 +28,4 @@ def printer_table(results: Mapping[str, Any]) -> Table | None:
         "In mm and degrees; x is the position_endstop that was there. Lean and skew of the rails have no key in "
         "Klipper: identified.yaml holds them."
     )
-    return Table("printer.cfg (Klipper)", ("section", "key", "was", "write"), tuple(rows), note)
+    return Table("printer.cfg (Klipper)", ("section", "key", "was", "write"), tuple(rows), note, to_type=True)

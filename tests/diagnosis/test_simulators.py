@@ -112,7 +112,7 @@ def test_the_commands_take_it_and_simulate_its_parameters(cli: Cli, tmp_path: Pa
     )
     assert code == 0, told
     verdict = json.loads((tmp_path / "d" / "diagnosis.json").read_text(encoding="utf-8"))["verdict"]
-    assert verdict["effects"] == ["parameter spring1"] and "parameter spring1" in shown
+    assert verdict["effects"] == ["parameter spring1"] and "Wrong value of spring1" in shown
     code, shown, told = cli("check", *of)
     assert code == 0 and "payload" in shown, told
     code, _, told = cli("diagnose", *of, "--out", tmp_path / "d", "--effects", "parameter sprng1")
