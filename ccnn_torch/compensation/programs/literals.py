@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,7 +31,7 @@ class Literal:
     units: Sequence[str] = ()
 
 
-class Literals:
+class Literals(ABC):
     """A program whose positions are literals.
 
     Attributes:
@@ -65,11 +66,14 @@ class Literals:
             return [math.degrees(v) for v in value]
         return [*(1e3 * value[:3, 3]).tolist(), *self._turn(value[:3, :3], old[3:])]
 
+    @abstractmethod
     def _turn(self, rotation: Array, old: Sequence[float]) -> list[float]:
-        raise NotImplementedError
+        """An orientation `3 x 3` as the language writes it, near the numbers that were there."""
 
-    def _frame(self, numbers: Sequence[float]) -> Array:
-        raise NotImplementedError
+    @staticmethod
+    @abstractmethod
+    def _frame(numbers: Sequence[float]) -> Array:
+        """The frame `4 x 4` [m] of a position's numbers."""
 
 
 class Krl(Literals):
@@ -112,7 +116,8 @@ class Krl(Literals):
         angles = matrix_to_euler_zyx(torch.from_numpy(np.array(rotation))).tolist()
         return [math.degrees(angle) for angle in nearest_euler(angles, np.radians(old).tolist())]
 
-    def _frame(self, numbers: Sequence[float]) -> Array:
+    @staticmethod
+    def _frame(numbers: Sequence[float]) -> Array:
         return _frame_of(numbers[:3], euler_zyx_to_matrix(torch.tensor(np.radians(numbers[3:]))).numpy())
 
 
@@ -153,7 +158,8 @@ class Rapid(Literals):
         quaternion = matrix_to_quaternion(torch.from_numpy(rotation.copy())).numpy()
         return [math.copysign(1.0, float(quaternion @ np.array(old))) * float(v) for v in quaternion]
 
-    def _frame(self, numbers: Sequence[float]) -> Array:
+    @staticmethod
+    def _frame(numbers: Sequence[float]) -> Array:
         w, x, y, z = np.array(numbers[3:]) / np.linalg.norm(numbers[3:])
         turn = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -91,7 +91,7 @@ _PACKAGE = """<?xml version="1.0"?>
   <version>0.1.0</version>
   <description>Compensation of joints, written by ccnn_torch</description>
   <maintainer email="you@example.org">you</maintainer>
-  <license>TODO: yours</license>
+  <license>Proprietary</license>
   <buildtool_depend>ament_cmake</buildtool_depend>
   <depend>controller_interface</depend>
   <depend>hardware_interface</depend>
