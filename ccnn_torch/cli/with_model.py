@@ -363,9 +363,13 @@ def report(
     import sys
     import webbrowser
 
-    page = next((folder / name for name in ("report.html", "verify.html") if (folder / name).is_file()), None)
+    page = next(
+        (folder / name for name in ("report.html", "verify.html", "since.html") if (folder / name).is_file()), None
+    )
     if page is None:
-        raise InputError(f"{folder}: has no report.html or verify.html; name a folder that a command has filled")
+        raise InputError(
+            f"{folder}: has no report.html, verify.html or since.html; name a folder that a command has filled"
+        )
     # On Linux a browser that needs no display would take the terminal.
     shows = not sys.platform.startswith("linux") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if shows:

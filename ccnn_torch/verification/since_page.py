@@ -72,10 +72,11 @@ def since_tables(results: SinceResults, joints: Sequence[Coordinate]) -> list[Ta
         rows.append((change.text, number_text(change.probability, 2), size))
     note = "Seen from: the smallest change of one number that these rows would have shown, with odds of about 20 to 1."
     weighed = Table("What was weighed?", ("change", "probability", "seen from"), rows, note)
+    text = {change.name: change.text for change in results.changes}
     wanted = [
         (
             *(quantity_text(pose.joints[j.name], j.unit) for j in joints),
-            " or ".join(pose.separates) or "–",
+            " or ".join(text[name] for name in pose.separates) or "–",
             number_text(pose.gain, 3),
         )
         for pose in results.next_measurements
