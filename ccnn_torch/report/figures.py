@@ -91,7 +91,6 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
     return inner
 
 
-@styled
 def save_figure(figure: Figure, path: str | Path) -> list[Path]:
     """Write a figure as PNG and as SVG; equal figures give equal bytes.
 
@@ -105,7 +104,11 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
     Raises:
         WriteError: they cannot be written.
     """
-    png, svg = Path(path).with_suffix(".png"), Path(path).with_suffix(".svg")
+    return _saved(figure, path, ".png", ".svg")
+
+
+@styled
+def _saved(figure: Figure, path: str | Path, *endings: str) -> list[Path]:
     # The layout is found once and kept: finding it again for each file costs more than the drawing. The canvas that
     # measures the texts for it draws the PNG, too, and need not measure them again.
     figure.set_dpi(_PNG_DPI)
@@ -115,21 +118,21 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
         layout.execute(figure)
         figure.set_layout_engine("none")
     # Written by the canvases themselves: `savefig` draws everything once more beforehand, to find the layout.
-    for path, print_to, about in (
-        (png, canvas.print_png, {"Software": None}),
-        (svg, FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None}),
-    ):
+    for ending in endings:
         content = io.BytesIO()
-        print_to(content, metadata=about)
-        write_whole(path, content.getvalue())
-    return [png, svg]
+        if ending == ".png":
+            canvas.print_png(content, metadata={"Software": None})
+        else:
+            FigureCanvasSVG(figure).print_svg(content, metadata={"Date": None, "Creator": None})
+        write_whole(Path(path).with_suffix(ending), content.getvalue())
+    return [Path(path).with_suffix(ending) for ending in endings]
 
 
 def inline_figures(plots: Iterable[Plot], folder: Path) -> list[InlineFigure]:
-    """Save plots as `save_figure` does, and give them as figures of a page."""
+    """Save plots as SVG, the same as `save_figure` writes, and give them as figures of a page."""
     found = []
     for plot in plots:
-        _, svg = save_figure(plot.figure, folder / plot.name)
+        (svg,) = _saved(plot.figure, folder / plot.name, ".svg")
         text = inline_svg(svg.read_text(encoding="utf-8"), plot.name)
         found.append(InlineFigure(plot.name, plot.caption, text))
     return found
