@@ -119,11 +119,11 @@ def _saved(figure: Figure, path: str | Path, *endings: str) -> list[Path]:
         figure.set_layout_engine("none")
     # Written by the canvases themselves: `savefig` draws everything once more beforehand, to find the layout.
     for ending in endings:
+        print_to, about = canvas.print_png, {"Software": None}
+        if ending == ".svg":
+            print_to, about = FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None}
         content = io.BytesIO()
-        if ending == ".png":
-            canvas.print_png(content, metadata={"Software": None})
-        else:
-            FigureCanvasSVG(figure).print_svg(content, metadata={"Date": None, "Creator": None})
+        print_to(content, metadata=about)
         write_whole(Path(path).with_suffix(ending), content.getvalue())
     return [Path(path).with_suffix(ending) for ending in endings]
 
