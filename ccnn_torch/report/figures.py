@@ -118,10 +118,12 @@ def _saved(figure: Figure, path: str | Path, *endings: str) -> list[Path]:
         layout.execute(figure)
         figure.set_layout_engine("none")
     # Written by the canvases themselves: `savefig` draws everything once more beforehand, to find the layout.
-    for ending in endings:
-        print_to, about = canvas.print_png, {"Software": None}
-        if ending == ".svg":
-            print_to, about = FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None}
+    for ending, print_to, about in (
+        (".png", canvas.print_png, {"Software": None}),
+        (".svg", FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None}),
+    ):
+        if ending not in endings:
+            continue
         content = io.BytesIO()
         print_to(content, metadata=about)
         write_whole(Path(path).with_suffix(ending), content.getvalue())
