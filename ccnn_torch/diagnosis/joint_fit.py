@@ -32,8 +32,8 @@ from ccnn_torch.numerics.outliers import inlying
 # Estimates of prior scales, noise and weights of the rows, at most, and what they change in what is left from which
 # there is no other, as a share of it.
 _ROUNDS, _SETTLED = 4, 1e-2
-# Steps of Levenberg and Marquardt at each, at most, the first damping, and the share of the coefficients that a last step
-# may change.
+# Steps of Levenberg and Marquardt at each, at most, the first damping, and the share of the coefficients that a last
+# step may change.
 _STEPS, _DAMPING, _LAST = 12, 1e-8, 0.1
 # Times an effect that may have any period acts, at most: a gear train errs with more than one.
 _TIMES = 2

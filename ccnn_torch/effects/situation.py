@@ -48,7 +48,7 @@ class Situation:
         covariates: by name, `... x s` each [SI]: `time`, `temperature`, `load_NAME` (force along the pose coordinate
             NAME on the platform [N], or moment [N·m]), `direction1`…`directionN` (sign of the joint's last motion),
             `speed…`.
-        gravity: `3` [m/s²], in the frame of the poses; of an arm of which groups of rows have a base frame, in the arm's
+        gravity: `3` [m/s²], in the frame of the poses; of an arm with a base frame for each group of rows, in the arm's
             own base: a plate of sockets may stand in any direction.
         parameters: of the nominal machine, broadcast against the rows; None = its nominal ones.
         guess: poses near by, for mechanisms whose forward kinematics has no closed form, `... x s x p`; or None.
