@@ -47,7 +47,7 @@ def test_the_folder_has_everything(folder: Path) -> None:
     assert list(results["methods"]) == ["lm", "lm_per_leg", "tikhonov"]
     assert set(results["parameters"]["l1"]["spread"]) >= {"value", "sd"}
     assert [c["poses"] for c in results["counts"]] == [16]
-    plots = {p.stem for p in (folder / "plots").glob("*.png")}
+    plots = {p.stem for p in (folder / "plots").glob("*.svg")}
     assert plots >= {"pose_error", "parameters", "deviations_lengths", "map", "poses", "measurements", "correlation"}
     page = (folder / "report.html").read_text()
     assert page.count("<figure") == len(plots)
