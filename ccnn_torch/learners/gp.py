@@ -316,7 +316,7 @@ class GaussianProcess:
         self, inputs: Tensor, dual: Tensor, spread: Tensor, ask: Callable[[GPNetwork, Tensor], Tensor]
     ) -> Tensor:
         """Ask the network of every repeat; one at a time and in pieces, since they share no matrix."""
-        size = max(1, min(4 * _CHUNK, block_size(_COPIES * 8)) // (self._shape[1] * dual.shape[-1]))
+        size = max(1, min(_CHUNK, block_size(_COPIES * 8)) // (self._shape[1] * dual.shape[-1]))
         found = []
         for repeat, points in enumerate(inputs):
             network = self._network(repeat, dual, spread)
