@@ -235,11 +235,14 @@ def stopped(out: Path, keys: list[str], delay: float, number: signal.Signals) ->
     return process.returncode, told
 
 
+SHORT_SEARCH = ["ccnn.refinement_iterations=3", "ccnn.waves=2", "ccnn.wave_searches=1"]
+
+
 @pytest.mark.parametrize(
     ("number", "delay", "more"),
     [
         (signal.SIGINT, 0.0, []),
-        (signal.SIGKILL, 0.5, ["training.early_stop=true", "split.validation=0.2", "ccnn.refinement_iterations=3"]),
+        (signal.SIGKILL, 0.1, ["training.early_stop=true", "split.validation=0.2", *SHORT_SEARCH]),
     ],
 )
 def test_an_interrupted_or_killed_run_resumes_to_identical_results(

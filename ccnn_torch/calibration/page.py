@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from ccnn_torch.report.table import Table, table_of
 _WORSE = 1.01
 
 
+@cache
 def paper_case(case: str | None) -> dict[str, Any] | None:
     """What the paper prints of a case, as `paper.yaml` has it; None where `results.case` is none of its cases."""
     return None if case is None else read_yaml(Path(__file__).with_name("paper.yaml")).get(case.partition(":")[0])
