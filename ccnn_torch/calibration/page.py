@@ -148,8 +148,8 @@ def worse_text(results: RunResults) -> str:
     text = f"On held-out rows {best} makes it worse than {instead} ({left} → {right} {unit} RMS position error)"
     if parts and position.explained is not None and (position.explained.rms.median or after) <= _WORSE * alone:
         return (
-            f"{text}: the model is right, but its file holds commands back near singular poses; ccnn identify, then "
-            "ccnn compensate identified.yaml, commands by the geometry."
+            f"{text}: the model is right, but its file holds commands back near singular poses or at limits; "
+            "ccnn identify, then ccnn compensate identified.yaml, commands by the geometry."
         )
     if best == "constant":
         return f"{text}: what it learned of the training rows does not hold on others."

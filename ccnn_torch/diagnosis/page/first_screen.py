@@ -101,6 +101,11 @@ def _line(row: Sequence[str]) -> str:
 def _wrong(results: Block) -> str:
     verdict, open_ = results["verdict"], undetermined(results)
     found = [f.text for f in findings(results)]
+    if len(joints := results.get("joints", [])) > 1 and verdict["effects"]:
+        # Numbers, and what cannot be told from what, are in the table.
+        each = [(one, ", ".join(words_of(e).short for e in one["effects"])) for one in joints]
+        found = [f"{one['joint']} {one.get('word', '')}".strip() + f": {names}" for one, names in each if names]
+        return f"{capital('; '.join(found))}."
     if verdict["none"]:
         if open_:
             return f"{capital(open_)}; the likeliest: nothing beyond the noise."

@@ -22,9 +22,10 @@ from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 
 Array = NDArray[np.float64]
 _SECTION, _KEY = re.compile(r"\[([^\]]+)\]"), re.compile(r"([\w-]+)\s*[:=]\s*(.*)")
+_INCLUDE = re.compile(r"\s*\[include\s+([^\]]+)\]")
 _SAVED = "#*#"
 _TOWERS = (210.0, 330.0, 90.0)
-_MOST = 999
+_MOST, _DEEPEST = 999, 20
 # The object that is printed for DELTA_ANALYZE: six pillars around one in the middle, the first at tower A [deg, mm].
 _PILLARS = np.radians(210.0 + 60.0 * np.arange(6))
 _RADIUS, _RIDGE = 65.0, 4.5
@@ -58,7 +59,7 @@ def read_printer(path: Path) -> Printer | None:
     """
     if path.suffix.lower() != ".cfg" or not path.is_file():
         return None
-    text = read_text(path, CONFIG_LIMIT)
+    text = _whole(path, ())
     config = _sections(text)
     if "kinematics" not in config.get("printer", {}):
         return None
@@ -139,6 +140,25 @@ def _table(names: str, rows: Array) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _whole(path: Path, above: tuple[Path, ...]) -> str:
+    """The text of a file with those that it includes in their places, as Klipper reads them; above: who includes it."""
+    if path.resolve() in above or len(above) > _DEEPEST:
+        raise InputError(f"{path}: includes itself; remove that [include …]")
+    parts = []
+    for line in read_text(path, CONFIG_LIMIT).splitlines():
+        found = _INCLUDE.match(line)
+        parts += [line] if found is None else _included(path, found[1].strip(), (*above, path.resolve()))
+    return "\n".join(parts)
+
+
+def _included(path: Path, name: str, above: tuple[Path, ...]) -> list[str]:
+    there = sorted(path.parent.glob(name)) if not Path(name).is_absolute() else [Path(name)]
+    files = [file for file in there if file.is_file()]
+    if not files and not re.search(r"[*?\[]", name):
+        raise InputError(f"{path}: [include {visible(name, 60)}]: there is no such file beside it; copy it there")
+    return [_whole(file, above) for file in files]
+
+
 def _sections(text: str) -> dict[str, dict[str, str]]:
     """Values by section and key, those that SAVE_CONFIG wrote over the others."""
     found: dict[str, dict[str, str]] = {}
@@ -160,7 +180,7 @@ def _number(
     if text is None and usual is not None:
         return usual
     if text is None:
-        raise InputError(f"{path}: [{section}] has no {key}; write it there (files that it includes are not read)")
+        raise InputError(f"{path}: [{section}] has no {key}; write it there")
     return float(_numbers(text, 1, f"{path}: [{section}] {key}")[0])
 
 
