@@ -259,7 +259,8 @@ def diagnose(
 
     ccnn diagnose --since runs/ur10/model.safetensors new.csv --out runs/ur10_now
     """
-    if overrides and records is None and Path(overrides[0]).suffix.lower() in _TABLES:
+    first = Path(overrides[0]) if overrides else None
+    if overrides and first and records is None and (first.suffix.lower() in _TABLES or first.is_dir()):
         records, overrides = overrides[0], overrides[1:]
     with loading():
         from ccnn_torch.diagnosis.job import run_diagnosis

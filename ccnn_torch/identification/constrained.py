@@ -51,6 +51,7 @@ from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.mechanisms.frames.instrument import instrument
 from ccnn_torch.records.commanded import read_joints
 from ccnn_torch.records.load import read_source
+from ccnn_torch.verification.promise import configurations, promise_block
 
 # Links and noise are estimated in turn, the noise from this size on [m].
 _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
@@ -442,6 +443,10 @@ def identify_by_constraint(
     results, arrays = assemble(config, measured, fit.selection, {"lm": found}, noise, _only_by_prior(fit, found.known))
     told = [{"rows": len(own.joints), "unit": "rad" if _angles_alone(own) else "m"} for _, own in others]
     results["constraint"] = _constraint(config, rows, fit, told)
+    if rows.in_sockets and bool(held.any()):
+        # Other constraints show less than a place, to which new positions could not be held.
+        first, last = (PoseError(error.position[0], None) for error in (before, after))
+        results["promise"] = promise_block(first, last, configurations(rows.joints[held], mechanism.joints))
     return measured, {"lm": outcome}, results, arrays | picture
 
 

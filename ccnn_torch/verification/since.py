@@ -202,7 +202,7 @@ def _rows_of(model: LoadedModel, machine: Mechanism, loaded: Any) -> _Rows:
         if block is None:
             raise InputError(
                 f"{model.path}: promises no error of the {kind} for new rows, so nothing says what is a change; take a "
-                "model that held rows out, an identified.yaml with its identified.json beside it (not one of sockets)"
+                "model that held rows out, an identified.yaml with its identified.json beside it, and not of distances"
             )
         kept[kind] = float(block["rms"])
         sigma[mine] = kept[kind] / math.sqrt(int(mine.sum()))

@@ -104,7 +104,8 @@ def _wrong(results: Block) -> str:
     if len(joints := results.get("joints", [])) > 1 and verdict["effects"]:
         # Numbers, and what cannot be told from what, are in the table.
         each = [(one, ", ".join(words_of(e).short for e in one["effects"])) for one in joints]
-        found = [f"{one['joint']} {one.get('word', '')}".strip() + f": {names}" for one, names in each if names]
+        named = [(_joint(one["joint"]), one.get("word"), names) for one, names in each if names]
+        found = [f"{joint} ({word}): {names}" if word else f"{joint}: {names}" for joint, word, names in named]
         return f"{capital('; '.join(found))}."
     if verdict["none"]:
         if open_:
