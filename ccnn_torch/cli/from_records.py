@@ -296,8 +296,8 @@ def _diagnose_since(model: Path, wanted: DiagnoseConfig, details: bool, quiet: b
     with if_stopped(NOTHING_WRITTEN):
         folder, loaded = folder_of(wanted, "since.json"), load_compensation(model)
         keys = {name: getattr(wanted, name) for name in ("columns", "joint_map", "mechanism_keys", "seed")}
-        results = what_changed(loaded, wanted.records, wanted.mechanism, **keys)
-        write_since(folder, results, loaded.joints)
+        results, picture = what_changed(loaded, wanted.records, wanted.mechanism, **keys)
+        write_since(folder, results, loaded.joints, picture)
     if quiet:
         return
     say(results.text)

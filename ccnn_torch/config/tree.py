@@ -251,6 +251,10 @@ class JobConfig(Section):
         return dump_yaml(tree)
 
 
+# Keys of another command that a remark names; a resolved config has all of them.
+_LISTED = 8
+
+
 def _used(tree: dict[str, Any], model: type[BaseModel], path: Path, note: Note | None) -> dict[str, Any]:
     """A file's keys without those that `ccnn run` alone has; of a config for `ccnn run` the shared ones."""
     run, shared = config_model("run"), getattr(model, "of_a_run", ())
@@ -269,7 +273,8 @@ def _used(tree: dict[str, Any], model: type[BaseModel], path: Path, note: Note |
     left = [n for n in sorted(names) if (first := n.partition(".")[0]) in {n, *kept} and first != "split"]
     if note is not None and left:
         are = "is a key of ccnn run and is" if len(left) == 1 else "are keys of ccnn run and are"
-        note(f"{path}: {', '.join(left)} {are} not used here.")
+        more = f" and {len(left) - _LISTED} more" if len(left) > _LISTED else ""
+        note(f"{path}: {', '.join(left[:_LISTED])}{more} {are} not used here.")
     return kept
 
 

@@ -39,7 +39,8 @@ from ccnn_torch.evidence.beam import search
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, covariance
 from ccnn_torch.evidence.judge import Explanation, Verdict, judge, marginal, posterior
 from ccnn_torch.evidence.priors import EFFECT
-from ccnn_torch.mechanisms import Mechanism, as_measured, sees_directions
+from ccnn_torch.mechanisms import Instrument, Mechanism, as_measured, sees_directions
+from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.designs import Candidates
 from ccnn_torch.records import load_records
@@ -64,6 +65,7 @@ _CHANCE = 0.01
 _SEEN = 4.0
 # Poses that are proposed, of so many drawn; those that say less [nat] are not worth measuring.
 _WANTED, _DRAWN, _TELLING = 5, 400, 0.01
+_SPACE = 3
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,8 @@ def what_changed(
     joint_map: Mapping[str, str] | None = None,
     mechanism_keys: Mapping[str, Any] | None = None,
     seed: int = 0,
-) -> SinceResults:
-    """What changed since a model was made.
+) -> tuple[SinceResults, dict[str, Tensor]]:
+    """What changed since a model was made, and the arrays of its picture.
 
     Args:
         model: as `load_compensation` gives it.
@@ -175,7 +177,7 @@ def what_changed(
         text="",
     )
     results.text = since_text(results)
-    return results
+    return results, _drawn(rows, dictionary, verdict.chosen.best)
 
 
 def _rows_of(model: LoadedModel, machine: Mechanism, loaded: Any) -> _Rows:
@@ -336,6 +338,18 @@ def _gap(rows: _Rows, dictionary: Dictionary, found: FittedSet, unit: str) -> Ga
     # A direction is a vector of length 1.
     length = unit == "m" and not sees_directions(rows.situation.mechanism)
     return Gap(unit="m" if length else "rad", before=rms(rows.residual), after=after, promised=promised)
+
+
+def _drawn(rows: _Rows, dictionary: Dictionary, found: FittedSet) -> dict[str, Tensor]:
+    """The machine with the errors of the new rows about the model, and what the change leaves; {} of readings."""
+    here, places = rows.situation, [k for k, channel in enumerate(rows.channels.tolist()) if channel < _SPACE]
+    if isinstance(here.mechanism, Instrument) or not places:
+        return {}
+    after = _left_out(rows, dictionary, found) if found.members else rows.residual
+    axes = rows.channels[places]
+    whole = [each.new_zeros(len(each), _SPACE).index_copy_(1, axes, each[:, places]) for each in (rows.residual, after)]
+    place = here.mechanism.frame(here.pose)[0]
+    return drawn(here.mechanism, here.joints, here.pose, place, *whole)
 
 
 def _left_out(rows: _Rows, dictionary: Dictionary, found: FittedSet) -> Tensor:
