@@ -39,14 +39,14 @@ from ccnn_torch.identification.constrained_rows import (
     read_constraint,
     rows_of,
 )
+from ccnn_torch.identification.judge import drawn_sizes
 from ccnn_torch.identification.measured import Kinematics, Measured, Rows, nominal_machine
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.poses import forward_problem
 from ccnn_torch.identification.problems.problem import joined
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
-from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, PoseError, Seen, SerialArm
-from ccnn_torch.mechanisms.drawn import drawn
+from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, PoseError, SerialArm
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.mechanisms.frames.instrument import instrument
 from ccnn_torch.records.commanded import read_joints
@@ -414,7 +414,7 @@ def identify_by_constraint(
     fit = fit_constraint(config, mechanism, rows, progress, others)
     held = rows.weights == 0
     before, after = (_held_error(mechanism, rows, s, held) for s in (fit.before, fit.after))
-    picture = _drawn(mechanism, rows.joints[held], before.position[0], after.position[0], fit.after.geometry)
+    picture = drawn_sizes(mechanism, rows.joints[held], before.position[0], after.position[0], fit.after.geometry)
     if config.fits_again() and bool(held.any()):
         every = replace(rows, weights=torch.ones_like(rows.weights))
         again = fit_constraint(config, mechanism, every, None, others)
@@ -448,15 +448,6 @@ def identify_by_constraint(
         first, last = (PoseError(error.position[0], None) for error in (before, after))
         results["promise"] = promise_block(first, last, configurations(rows.joints[held], mechanism.joints))
     return measured, {"lm": outcome}, results, arrays | picture
-
-
-def _drawn(mechanism: Mechanism, joints: Tensor, before: Tensor, after: Tensor, geometry: Tensor) -> dict[str, Tensor]:
-    """The machine at the held-out rows `t x n` with the sizes of their errors `t` [m]; a constraint has no pose."""
-    arm, values = mechanism, geometry
-    if isinstance(mechanism, Seen):
-        arm, values = mechanism.mechanism, geometry[: len(mechanism.mechanism.geometry)]
-    pose = arm.forward_kinematics(joints, values)
-    return drawn(arm, joints, pose, arm.frame(pose)[0], before, after, values)
 
 
 def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
