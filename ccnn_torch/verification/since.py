@@ -63,6 +63,8 @@ _FRAMES = {"frame": "base", "tool": "tool"}
 _CHANCE = 0.01
 # A change would have been seen from so many standard deviations of its number: odds of about 20 to 1.
 _SEEN = 4.0
+# From this probability on a change is told as one: of claims above it 94 of 99 were right (docs/how_to/verify.md).
+_SURE = 0.9
 # Poses that are proposed, of so many drawn; those that say less [nat] are not worth measuring.
 _WANTED, _DRAWN, _TELLING = 5, 400, 0.01
 _SPACE = 3
@@ -457,9 +459,10 @@ def since_text(results: SinceResults) -> str:
         said = said if results.rest else "Nothing changed that these rows show"
         return f"{said}: on {rows} the {what} is off by {before} RMS{limit} (p {results.probability:.2f})."
     changed = " and ".join(_said(one) for one in results.changed)
+    sure = "Changed" if results.probability >= _SURE else "Perhaps changed"
     more = " Beside this more is left than the model promises." if results.rest else ""
     return (
-        f"Changed since the model was made: {changed} (p {results.probability:.2f}). "
+        f"{sure} since the model was made: {changed} (p {results.probability:.2f}). "
         f"On {rows} the {what} is off by {before} RMS, and by {after} with this change, each row left out in turn"
         f"{limit}.{more}"
     )
