@@ -346,8 +346,8 @@ def _drawn(calibration: Calibration, test: Tensor) -> dict[str, Tensor]:
         place = mechanism.frame(pose)[0]
     else:
         (place, before), after = place_and_error(prepared, k), outcome.left[k, :, :3]
-    rows = (each[test].detach() for each in (joints, pose, place, before, after))
-    return drawn(mechanism, *rows, parameters)
+    joints, pose, place, before, after = (each[test].detach() for each in (joints, pose, place, before, after))
+    return drawn(mechanism, joints, pose, place, before, after, parameters)
 
 
 def _history(training: Training) -> dict[str, NDArray[np.float64]]:
