@@ -19,7 +19,7 @@ from ccnn_torch.identification import Fit, Progress
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig, base_method
 from ccnn_torch.identification.constrained import identify_by_constraint
 from ccnn_torch.identification.identifiability import bootstrap
-from ccnn_torch.identification.judge import map_error, read_elsewhere, transferred
+from ccnn_torch.identification.judge import drawn_errors, map_error, read_elsewhere, transferred
 from ccnn_torch.identification.measured import Measured, from_records, nominal_machine
 from ccnn_torch.identification.page import identified_page, not_settled, write_identified_csv, write_identified_report
 from ccnn_torch.identification.result import Found, assemble, beside_truth, judged, known_at, promised, residuals_of
@@ -175,11 +175,13 @@ def _judged(
 ) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Outcome]]:
     """The content of `identified.json`, tensors by name for the pictures, and the outcome of every method."""
     selection, first = select(measured, config), config.methods[0]
+    picture = drawn_errors(measured, outcomes[first].values)
     found = {name: judged(config, measured, selection, name, outcome) for name, outcome in outcomes.items()}
     found = {name: _refitted(config, measured, name, one) for name, one in found.items()}
     outcomes = {name: one.outcome for name, one in found.items()}
     resampled = _bootstrap(config, measured, outcomes)
     results, arrays = assemble(config, measured, selection, found, _given_noise(config, measured), (), resampled)
+    arrays |= picture
     results["promise"] = promised(measured, found[first])
     one = outcomes[first].machines[:1]
     arrays |= residuals_of(pieces_of(measured, config, is_apart(first, config), one), selection, outcomes[first])

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ccnn_torch.compensation.targets.machines import STEPPERS, klipper_numbers
+from ccnn_torch.compensation.targets.machines import klipper_numbers
+from ccnn_torch.records.formats.klipper import STEPPERS
 from ccnn_torch.report.table import Table
 
 
