@@ -180,8 +180,9 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
     arm = inside(mechanism)
     if isinstance(arm, SerialArm) and parameters is not None and "base" in arm.unknown_frames:
-        # Where the measuring device stands says nothing about gravity; frames by group of rows share the first one's.
-        down = rotation_vector_to_matrix(parameters.reshape(-1, parameters.shape[-1])[0, 3:6]) @ down
+        # Where the measuring device stands says nothing about gravity.
+        if not has_upright_base(mechanism):
+            down = rotation_vector_to_matrix(parameters.reshape(-1, parameters.shape[-1])[0, 3:6]) @ down
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
     _refuse_no_sign(records, covariates)
     mechanism, more = simulator_inputs(records, mechanism, covariates)
