@@ -13,11 +13,11 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
 from ccnn_torch.diagnosis.from_records import named_machine, situation_of
+from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.diagnosis.page.outputs import write_corrected
+from ccnn_torch.diagnosis.residual.linearisation import remainder
 from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
-from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
-from ccnn_torch.diagnosis.residual.linearisation import remainder
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, pose_residual, reached
 from ccnn_torch.effects.found_machine import machine_of_block
 from ccnn_torch.errors import InputError
