@@ -307,12 +307,9 @@ def run_plots(folder: str | Path, results: RunResults) -> list[Plot]:
     if (folder / ARRAYS_FILE).is_file():
         arrays = load_arrays(folder)
         words = "With " + " + ".join([*results.pose.parts, arrays.labels.get("method", "the model")])
-        plots += [
-            machine_plot(arrays.drawn, words),
-            pose_error_plot(arrays),
-            workspace_plot(arrays),
-            joint_error_plot(arrays),
-        ]
+        # What mostly turns has no places to draw errors at, but a map of its angles.
+        plots.append(machine_plot(arrays.drawn, words) or workspace_plot(arrays))
+        plots += [pose_error_plot(arrays), joint_error_plot(arrays)]
         if arrays.masks:
             names = [joint.name for joint in arrays.joints]
             method = arrays.labels.get("method", "model")
