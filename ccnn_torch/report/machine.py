@@ -24,6 +24,8 @@ _PLACE, _BEFORE, _AFTER, _LINE = "drawn.place", "drawn.before", "drawn.after", "
 _MOST_ARROWS = 160
 # Length of a large arrow, the 90 % quantile, as a share of the width of the poses.
 _LENGTH = 0.12
+# How far above a panel the scale of its errors is [inches].
+_ABOVE = 0.15
 # Of the width below which a machine has no second direction.
 _FLAT = 1e-3
 
@@ -70,9 +72,11 @@ def machine_plot(arrays: Mapping[str, Array], after_words: str, before_words: st
     sizes = [float(np.sqrt(np.square(values).mean())) for values in norms]
     scale, unit = display_unit("m", sizes[0])
     titles = (before_words, after_words)
+    # Between title and panel, however high this is.
+    above = 1 + _ABOVE / inches[1]
     for axes, values, size, title, colour in zip(panels, (before, after), sizes, titles, (BEFORE, AFTER), strict=True):
         axes.scatter(1e3 * place[chosen][:, plane[0]], 1e3 * place[chosen][:, plane[1]], s=5, color=GREY, linewidths=0)
-        _draw_errors(axes, place[chosen][:, plane], values[chosen], plane, times, long, colour)
+        _draw_errors(axes, place[chosen][:, plane], values[chosen], plane, times, long, above, colour)
         axes.set_title(f"{title}\nRMS {number_text(size / scale, 3)} {unit}", pad=19)
         _frame(axes, plane, place, _LENGTH * width)
     shown = "" if len(chosen) == len(place) else f", {len(chosen)} of {len(place)} rows"
@@ -90,9 +94,9 @@ def machine_plot(arrays: Mapping[str, Array], after_words: str, before_words: st
 
 
 def _draw_errors(
-    axes: Axes, place: Array, values: Array, plane: list[int], times: float, long: float, colour: str
+    axes: Axes, place: Array, values: Array, plane: list[int], times: float, long: float, above: float, colour: str
 ) -> None:
-    """Errors at places `s x 2` [m]: arrows of vectors `s x 3`, circles of sizes `s` [m]; and their scale."""
+    """Errors at places `s x 2` [m]: arrows of vectors `s x 3`, circles of sizes `s` [m]; and above them their scale."""
     across, up = 1e3 * place.T
     key = _round(long)
     scale, unit = display_unit("m", key)
@@ -100,7 +104,7 @@ def _draw_errors(
         for x, y, size in zip(across, up, values, strict=True):
             axes.add_patch(Circle((x, y), 500 * times * size, edgecolor=colour, facecolor="none", linewidth=1.0))
         text = f"diameter = error {times:g} ×"
-        axes.annotate(text, (0.01, 1.03), xycoords="axes fraction", fontsize=8.5)
+        axes.annotate(text, (0.01, above), xycoords="axes fraction", fontsize=8.5, va="center")
         return
     arrows = axes.quiver(
         across,
@@ -113,7 +117,7 @@ def _draw_errors(
         width=0.005,
     )
     label = f"{key / scale:g} {unit} (arrows {times:g} ×)"
-    axes.quiverkey(arrows, 0.01, 1.05, 1e3 * times * key, label, labelpos="E", fontproperties={"size": 8.5})
+    axes.quiverkey(arrows, 0.01, above, 1e3 * times * key, label, labelpos="E", fontproperties={"size": 8.5})
 
 
 def _draw_machine(axes: Axes, lines: Mapping[str, Array], place: Array, plane: list[int]) -> None:
