@@ -90,37 +90,6 @@ def convergence_plot(
     return Plot(f"convergence_{method}", figure, f"Progress of {method} over {len(step)} recorded steps{band}.")
 
 
-@styled
-def population_plot(history: Mapping[str, Array], method: str) -> Plot | None:
-    """Connection density and diversity of each subpopulation against the generation.
-
-    Args:
-        history: `step`: `t`, `density` and `diversity`: `t x r x k`.
-
-    Returns:
-        None when the history has neither.
-    """
-    names = [name for name in ("density", "diversity") if name in history]
-    if not names:
-        return None
-    texts = {"density": "share of connections [1]", "diversity": "diversity [1]"}
-    figure = Figure(figsize=(4.5 * len(names) + (1.5 if len(names) == 1 else 0), 3.3), layout="constrained")
-    for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
-        values = history[name]
-        for i in range(values.shape[2]):
-            _draw_band(axes, history["step"], values[..., i], SERIES[i % len(SERIES)], f"subpopulation {i + 1}")
-        axes.set(title=name.capitalize(), xlabel="generation", ylabel=texts[name])
-        axes.set_ylim(bottom=0)
-        axes.legend(loc="best")
-    layers, repeats = history[names[0]].shape[2], history[names[0]].shape[1]
-    return Plot(
-        f"population_{method}",
-        figure,
-        f"{' and '.join(names).capitalize()} of the {layers} subpopulations of {method} (one for each layer of "
-        f"connections, the first next to the inputs), over {count_text(repeats, 'repeat')}.",
-    )
-
-
 def _held_out(history: Mapping[str, Array]) -> list[str]:
     if "heldout_mse_all" in history:
         return ["heldout_mse_all"]
@@ -318,7 +287,6 @@ def run_plots(folder: str | Path, results: RunResults) -> list[Plot]:
     plots.append(progress_plot(histories, unit=unit, **lines))
     for method, history in histories.items():
         plots.append(convergence_plot(history, method, unit=unit, **lines))
-        plots.append(population_plot(history, method))
     return [plot for plot in plots if plot is not None]
 
 

@@ -255,8 +255,6 @@ def _parameter_table(results: Block) -> Table:
     else:
         columns["identified - nominal"] = column(lambda p, scale: number_text((p["value"] - p["nominal"]) / scale, 4))
     columns["standard deviation"] = column(lambda p, scale: figure_text(p, "sd", scale) if p["identifiable"] else lost)
-    if any("sd_bootstrap" in block for block in free.values()):
-        columns["by bootstrap"] = column(lambda p, scale: figure_text(p, "sd_bootstrap", scale))
     several = results["machines"] > 1
     note = f"Solver: {results['method']}." + " Medians over the machines, [5 %, 95 %]." * several
     return table_of("Parameters", columns, f"{note} {_interval_note(results)}", ["nominal"])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -218,27 +218,38 @@ def draw_joint_error(axes: Axes, arrays: RunArrays, joint: int) -> None:
     axes.margins(x=0.015)
 
 
-@styled
 def pose_error_plot(arrays: RunArrays) -> Plot:
     """Distribution of the held-out pose error before and after, position and (where there is one) orientation."""
-    pairs = arrays.pose_errors
-    figure = Figure(figsize=(4.6 * len(pairs) + (1.2 if len(pairs) == 1 else 0), 3.5), layout="constrained")
-    medians = []
-    for axes, (title, unit, before, after) in zip(figure.subplots(1, len(pairs), squeeze=False)[0], pairs, strict=True):
-        medians.append(_draw_distribution(axes, title, unit, before[arrays.test], after[arrays.test]))
-    return Plot(
-        "pose_error",
-        figure,
-        f"Share of the {count_text(int(arrays.test.sum()), 'held-out row')} whose pose error is at most the value on "
-        f"the axis: {' and '.join(medians)}.",
-    )
+    rows = count_text(int(arrays.test.sum()), "held-out row")
+    errors = [
+        (title, unit, {"before": before[arrays.test], "after": after[arrays.test]})
+        for title, unit, before, after in arrays.pose_errors
+    ]
+    return distribution_plot(errors, f"Share of the {rows} whose pose error is at most the value on the axis")
 
 
-def _draw_distribution(axes: Axes, title: str, si_unit: str, before: Array, after: Array) -> str:
-    scale, unit = display_unit(si_unit, float(np.median(before)))
+_OF_ERRORS = {"before": BEFORE, "after": AFTER, "measurement noise": FLOOR}
+
+
+@styled
+def distribution_plot(errors: Sequence[tuple[str, str, Mapping[str, Array]]], caption: str) -> Plot:
+    """Share of rows whose error is at most so large, a panel for each kind of error.
+
+    Args:
+        errors: title, SI unit, and the errors `s` before and after, and of the measurement noise where it is known.
+        caption: its first words; the medians follow.
+    """
+    figure = Figure(figsize=(4.6 * len(errors) + (1.2 if len(errors) == 1 else 0), 3.5), layout="constrained")
+    panels = figure.subplots(1, len(errors), squeeze=False)[0]
+    medians = [_draw_distribution(axes, *one) for axes, one in zip(panels, errors, strict=True)]
+    return Plot("pose_error", figure, f"{caption}: {' and '.join(medians)}.")
+
+
+def _draw_distribution(axes: Axes, title: str, si_unit: str, errors: Mapping[str, Array]) -> str:
+    scale, unit = display_unit(si_unit, float(np.median(errors["before"])))
     medians = []
-    for values, colour, label in ((before, BEFORE, "before"), (after, AFTER, "after")):
-        shown = np.sort(values) / scale
+    for label, values in errors.items():
+        shown, colour = np.sort(values) / scale, _OF_ERRORS[label]
         median = float(np.median(shown))
         medians.append(median)
         share = np.arange(1, len(shown) + 1) / len(shown) * 100
@@ -247,8 +258,8 @@ def _draw_distribution(axes: Axes, title: str, si_unit: str, before: Array, afte
         axes.annotate(
             number_text(median, 3), (median, 50), xytext=(7, -11), textcoords="offset points", color=colour, fontsize=9
         )
-    least = min(float(v[v > 0].min()) if (v > 0).any() else np.inf for v in (before, after))
-    if np.isfinite(least) and before.max() / least > 10:
+    least = min(float(v[v > 0].min()) if (v > 0).any() else np.inf for v in errors.values())
+    if np.isfinite(least) and errors["before"].max() / least > 10:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_title(title.capitalize())

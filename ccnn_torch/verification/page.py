@@ -17,11 +17,8 @@ def write_verify_report(folder: Path, results: VerifyResults, arrays: RunArrays)
     """Write `verify.html` and `verify.json` into a folder, which is made."""
     # Imported here: it loads matplotlib.
     from ccnn_torch.report.figures import inline_figures, joint_error_plot, pose_error_plot
-    from ccnn_torch.verification.figure import pose_rows_plot, predicted_plot
 
-    plots = [pose_rows_plot(arrays), pose_error_plot(arrays), joint_error_plot(arrays)]
-    if not results.compensated:
-        plots.insert(0, predicted_plot(arrays))
+    plots = [pose_error_plot(arrays), joint_error_plot(arrays)]
     with TemporaryDirectory() as scratch:
         figures = [
             figure._replace(caption=figure.caption.replace("held-out row", "new row"))

@@ -10,7 +10,7 @@ from diagnosis_cases import one_effect, with_rotation
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
-from ccnn_torch.diagnosis.page.figure_rows import machine_plot
+from ccnn_torch.diagnosis.page.figures import machine_plot
 
 
 def _arrays() -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.colors import LogNorm
 from report_runs import arm_run
 
-from ccnn_torch.calibration.figures import alive_nodes, convergence_plot, network_plot, population_plot
+from ccnn_torch.calibration.figures import alive_nodes, convergence_plot, network_plot
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays
@@ -45,7 +45,6 @@ def all_plots(arrays: RunArrays, history: dict[str, np.ndarray]) -> list[Plot | 
         workspace_plot(arrays),
         overview_plot(arrays),
         convergence_plot(history, "ccnn", floor=1e-10, constant=1.55e-10, unit="m"),
-        population_plot(history, "ccnn"),
         network_plot(arrays.masks, arrays.weights, "ccnn", ["q1", "q2", "q3"]),
     ]
 
@@ -176,7 +175,6 @@ def test_convergence_draws_the_median_over_repeats(history: dict[str, np.ndarray
     assert set(dots(plot, 1, "noise floor")) == {1e-10} and set(dots(plot, 1, "constant")) == {1.55e-10}
     assert convergence_plot({"step": history["step"]}, "x") is None
     assert convergence_plot({name: values[:1] for name, values in history.items()}, "constant") is None
-    assert population_plot({"step": history["step"]}, "x") is None
 
 
 def reachable(masks: list[np.ndarray]) -> list[np.ndarray]:

@@ -178,18 +178,14 @@ def _notes(results: Block, about: About) -> list[str]:
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
-    from ccnn_torch.diagnosis.page.figure_rows import machine_plot, signature_plot
-    from ccnn_torch.diagnosis.page.figures import course_plot, gap_plot, probability_plot, remainder_map, where_plot
+    from ccnn_torch.diagnosis.page.figures import course_plot, machine_plot, remainder_map, signature_plot
 
     effects = list(results["verdict"]["effects"])
     plots = (
         course_plot(results, arrays),
         machine_plot(arrays, effects),
-        gap_plot(results),
-        probability_plot(results),
         signature_plot(signatures_of(arrays, labels, effects), arrays, effects),
         remainder_map(arrays, about),
-        where_plot(results, about),
     )
     return [plot for plot in plots if plot is not None]
 
@@ -203,10 +199,10 @@ def _sections(
     parameters = parameter_table(results, 12 if screen else 24)
     where = where_table(results, about, telling=screen)
     planned: list[tuple[str, tuple[str, ...], tuple[Table | None, ...]]] = [
-        ("How large is the gap?", ("gap",), (gap_table(results, about), order)),
-        ("Which effect?", ("probabilities",), (effects, parameters)),
+        ("How large is the gap?", (), (gap_table(results, about), order)),
+        ("Which effect?", (), (effects, parameters)),
         ("What gives it away?", ("signatures",), ()),
-        ("Where is the gap?", ("map", "where", "course"), (where, region_table(results, about))),
+        ("Where is the gap?", ("map", "course"), (where, region_table(results, about))),
         ("Which effects do these rows not distinguish?", (), (confusable_table(results),)),
         ("What can these records not show?", (), (unseen_table(results), record_table(results))),
         ("What should be measured next?", (), (next_table(results, about),)),
