@@ -238,9 +238,10 @@ def export(
     ccnn export runs/printer/identified.yaml --to klipper --current printer.cfg --out firmware
     """
     with if_stopped(NOTHING_WRITTEN):
-        from ccnn_torch.compensation.targets.export import export_told
+        from ccnn_torch.compensation.targets.export import export_model
 
-        files, left = export_told(model, to, out, dtype, sd, public_key, allow_code, current)
+        told: list[str] = []
+        files = export_model(model, to, out, dtype, sd, public_key, allow_code, current, told.append)
     if not quiet:
         proven = (
             "; their operations give the model's numbers"
@@ -250,10 +251,10 @@ def export(
         typer.echo(f"{out}: {', '.join(files)} written{proven}.")
         if to == "c99":
             typer.echo(f"Compile them and compare golden vectors: make -C {out} test")
-        if left:
+        if told:
             from ccnn_torch.report.screen import say
 
-            say(left)
+            say(*told)
             typer.echo(f"How to load them: {out / 'README.md'}")
 
 
@@ -303,8 +304,9 @@ def verify(
         if wanted.records is None:
             raise InputError("records: are missing; give RECORDS.csv, --records, or the key in a config")
         loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
-        read = {"columns": wanted.columns, "joint_map": wanted.joint_map, "mechanism_keys": wanted.mechanism_keys}
-        found = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, allow_code, **read)
+        how = {name: getattr(wanted, name) for name in ("columns", "joint_map", "mechanism_keys")}
+        how["allow_code"] = allow_code
+        found = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, **how)
         write_verify_report(out, found.results, found.arrays)
     results = found.results
     if not quiet:

@@ -133,7 +133,6 @@ class SimulateConfig(Section):
     counts: list[int] = Field(
         default=[], description="numbers of measured poses for which the study is repeated (measurements needed)"
     )
-    map: int = Field(default=0, ge=0, description="points across a map of the pose error over the workspace; 0 = none")
 
 
 class IdentifyConfig(JobConfig):

@@ -18,7 +18,7 @@ from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig, base_method
 from ccnn_torch.identification.constrained import identify_by_constraint
-from ccnn_torch.identification.judge import map_error, read_elsewhere, transferred
+from ccnn_torch.identification.judge import read_elsewhere, transferred
 from ccnn_torch.identification.measured import Measured, from_records, nominal_machine
 from ccnn_torch.identification.page import identified_page, not_settled, write_identified_csv, write_identified_report
 from ccnn_torch.identification.result import Found, assemble, beside_truth, judged, known_at, promised
@@ -183,13 +183,8 @@ def _judged(
         return results, arrays, outcomes
     arrays["truth"] = measured.truth
     for name, one_found in found.items():
-        block, more = beside_truth(config, measured, selection, name, one_found)
-        results["methods"][name] |= block
-        arrays |= more
+        results["methods"][name] |= beside_truth(config, measured, selection, one_found)
     results["compensation"] = results["methods"][first]["compensation"]
-    error = map_error(measured, measured.start, torch.arange(measured.machines))
-    if measured.map is not None and error is not None:
-        arrays |= {"map": measured.map, "map_before": error}
     return results, arrays, outcomes
 
 

@@ -18,7 +18,6 @@ from ccnn_torch.identification.judge import (
     commanded,
     doubts_of,
     figures,
-    map_error,
     noise_of_test,
     predicted,
 )
@@ -228,10 +227,8 @@ def promised(measured: Measured, found: Found) -> dict[str, Any] | None:
     return promise_block(before, after, configurations(measured.test.joints[0], measured.mechanism.joints))
 
 
-def beside_truth(
-    config: IdentifyConfig, measured: Measured, selection: Selection, method: str, found: Found
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """What simulated machines show of a method: entries of its block, and tensors by name."""
+def beside_truth(config: IdentifyConfig, measured: Measured, selection: Selection, found: Found) -> dict[str, Any]:
+    """What simulated machines show of a method: entries of its block."""
     outcome, machines = found.outcome, found.outcome.machines
     assert measured.truth is not None
     truth = measured.truth[machines]
@@ -252,8 +249,7 @@ def beside_truth(
         block["compensation"] = {
             name: before_and_after(sent.before, getattr(sent, name), removed=True) for name in ("exact", "linear")
         }
-    error = map_error(measured, outcome.values, machines)
-    return block, {} if error is None else {f"map_{method}": error}
+    return block
 
 
 def _deviations(selection: Selection, gap: Tensor, error: Tensor) -> dict[str, Any]:

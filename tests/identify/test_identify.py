@@ -13,9 +13,9 @@ import ccnn_torch
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.measured import make_kinematics
+from ccnn_torch.identification.simulated import Places, PointsView
 from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
 from ccnn_torch.records import write_table
-from ccnn_torch.simulation.places import Places, PointsView
 
 FIVE_BAR: dict[str, Any] = {
     "machines": 60,

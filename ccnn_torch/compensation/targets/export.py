@@ -150,6 +150,7 @@ def export_model(
     public_key: str | Path | None = None,
     allow_code: bool = False,
     current: str | Path | None = None,
+    tell: Callable[[str], None] = lambda left: None,
 ) -> dict[str, Path]:
     """Write a model as source code, table or file of a controller, robot or simulator.
 
@@ -161,6 +162,7 @@ def export_model(
         sd: with a function for the standard deviation of the deviation.
         public_key, allow_code: as `load_model`.
         current: the user's own file of a stack, from which names and numbers are taken that a machine does not have.
+        tell: is given what the files leave of the machine's error, where they do not hold all of the model.
 
     Returns:
         The files by name.
@@ -171,20 +173,6 @@ def export_model(
         MethodFailedError: the model cannot be expressed so, or single precision does not hold it.
         WriteError: a file cannot be written.
     """
-    return export_told(path, to, out, dtype, sd, public_key, allow_code, current)[0]
-
-
-def export_told(
-    path: str | Path,
-    to: str,
-    out: str | Path,
-    dtype: str = "float64",
-    sd: bool = False,
-    public_key: str | Path | None = None,
-    allow_code: bool = False,
-    current: str | Path | None = None,
-) -> tuple[dict[str, Path], str]:
-    """As `export_model`, and what the files leave of the machine's error; empty where they hold all of the model."""
     for value, known, what in ((to, [*TARGETS], "target"), (dtype, DTYPES, "dtype")):
         if value not in known:
             near = nearest(value, known)
@@ -199,4 +187,6 @@ def export_told(
     contents = TARGETS[to](order)
     for name, content in contents.items():
         write_whole(folder / name, content)
-    return {name: folder / name for name in contents}, order.said
+    if order.said:
+        tell(order.said)
+    return {name: folder / name for name in contents}
