@@ -128,7 +128,7 @@ class _Source:
 
     def told(self, problem: Problem, values: Tensor) -> dict[str, Any]:
         """How many rows, and of the first group the noise and what is left [SI]."""
-        about = {"rows": len(self.rows.joints), "unit": "rad" if _angles_alone(self.rows) else "m"}
+        about = {"rows": len(self.rows.joints), "unit": self.rows.unit}
         before, after = (float(self.left(problem, at)[0]) for at in (problem.start, values))
         return about | {"noise": float(self.noise[0]), "before": before, "after": after}
 
@@ -170,10 +170,9 @@ def fit_constraint(
     choice = ParameterChoice(of_machine, (), about.tied, {**_priors(config, mechanism, of_machine), **about.prior})
     before = _tool_first(mechanism, rows, build, tool, choice)
     solver = solver_of("lm", config)
-    given = [(config.noise, "noise")]
-    given += [(one.noise, f"constraint.beside.{i}.noise") for i, one in enumerate(config.constraint.beside)]
-    every = [(build, rows), *others]
-    sources = [_source(make, own, noise, key) for (make, own), (noise, key) in zip(every, given, strict=True)]
+    sources = [_source(build, rows, config.noise, "noise")]
+    for i, (about_one, other) in enumerate(zip(config.constraint.beside, others, strict=True)):
+        sources.append(_source(*other, about_one.noise, f"constraint.beside.{i}.noise"))
     rounds = 1 if all(bool(s.known.all()) for s in sources) else _ROUNDS
     selection = select_parameters(mechanism.geometry, choice, before.geometry)
     shared = len(selection.parameters)
@@ -215,8 +214,7 @@ def _source(build: Build, rows: ConstraintRows, noise: Any, key: str) -> _Source
         # What is given by name is of that alone.
         numbers = [n if math.isnan(v) else len(read) + k for k, (n, v) in enumerate(zip(numbers, values, strict=True))]
     elif noise is not None:
-        unit = "rad" if _angles_alone(rows) else "m"
-        values = torch.full_like(values, size(noise, unit, key))
+        values = torch.full_like(values, size(noise, rows.unit, key))
         values = sizes_of_pose(noise, read, key) if len({*numbers}) > 1 else values
     _require_sizes(values[~values.isnan()].tolist(), key, "remove the key")
     every = sorted({*numbers}) or [0]
@@ -276,10 +274,6 @@ def _held_error(mechanism: Mechanism, rows: ConstraintRows, state: State, held: 
     return PoseError(parts[0], parts[1] if "rad" in units.values() else None)
 
 
-def _angles_alone(rows: ConstraintRows) -> bool:
-    return rows.seen is not None and all(c.unit == "rad" for c in rows.seen.pose[: rows.seen.compared])
-
-
 def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
     if about.kind == "sockets":
         several = len(torch.unique(rows.said, dim=0)) > 1
@@ -290,9 +284,8 @@ def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
         def sockets(choice: ParameterChoice, start: Tensor, noise: Any) -> Problem:
             # Without noise there is nothing to weigh the plate's scale against.
             scale = 0.0 if noise is None else plate
-            return socket_problem(
-                mechanism, rows.joints, rows.group, rows.said, noise, rows.weights, choice, start, scale
-            )
+            of = rows.joints, rows.group, rows.said
+            return socket_problem(mechanism, *of, noise, rows.weights, choice, start, scale)
 
         return sockets
 
@@ -495,7 +488,7 @@ def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit
             for number, label in rows.labels.items()
         ],
         "unknowns": unknowns,
-        "unit": "rad" if _angles_alone(rows) else "m",
+        "unit": rows.unit,
         "noise": float(fit.after.noise[0]),
         "noise_known": config.noise is not None,
         "beside": [

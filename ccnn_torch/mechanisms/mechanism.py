@@ -104,10 +104,7 @@ class Mechanism(nn.Module):
         super().__init__()
         verbs = ("closure", "solve_inverse", "forward_kinematics")
         if all(getattr(type(self), verb) is getattr(Mechanism, verb) for verb in verbs):
-            raise InputError(
-                f"mechanism '{name}' must define closure(pose, joints, parameters), solve_inverse(pose, …) or "
-                "forward_kinematics(joints, …)"
-            )
+            raise InputError(f"mechanism '{name}' must define {', '.join(verbs[:2])} or {verbs[2]}, see Mechanism")
         self.name = name
         self.joints = tuple(joints)
         self.pose = tuple(pose)
@@ -115,12 +112,11 @@ class Mechanism(nn.Module):
         self.register_buffer("nominal", torch.tensor([g.nominal for g in self.geometry], dtype=torch.float64))
         self.register_buffer("low", torch.tensor(low, dtype=torch.float64))
         self.register_buffer("high", torch.tensor(high, dtype=torch.float64))
-        self.register_buffer("home_pose", (self.low + self.high) / 2)
-        if home_pose is not None:
-            self.home_pose.copy_(torch.tensor(home_pose, dtype=torch.float64))
+        middle = (self.low + self.high) / 2
+        self.register_buffer("home_pose", middle if home_pose is None else middle.new_tensor(home_pose))
         self.register_buffer("home_joints", torch.zeros(len(self.joints), dtype=torch.float64))
-        given = None if home_joints is None else torch.tensor(home_joints, dtype=torch.float64)
-        self.home_joints.copy_(self.solve_inverse(self.home_pose) if given is None else given)
+        here = self.solve_inverse(self.home_pose) if home_joints is None else middle.new_tensor(home_joints)
+        self.home_joints.copy_(here)
         self.inverse_kinematics = InverseKinematics(self.solve_inverse)
         # How to build it again: `spec` and `keys` of `load_mechanism`, which fills this in for a user's class.
         own = type(self).__module__.startswith("ccnn_torch.mechanisms.machines.")
@@ -446,13 +442,12 @@ class Mechanism(nn.Module):
         Raises:
             InputError: the class is not defined in a file (an interactive session), so it cannot be built again.
         """
-        names = [g.name for g in self.geometry]
         return {
             "name": self.name,
             **(self.recipe or self._own_file()),
             "joints": [j.header for j in self.joints],
             "pose": [c.header for c in self.pose],
-            "parameters": dict(zip(names, self.nominal.tolist(), strict=True)),
+            "parameters": {g.name: v for g, v in zip(self.geometry, self.nominal.tolist(), strict=True)},
         }
 
     def _own_file(self) -> dict[str, Any]:
@@ -476,7 +471,7 @@ class Mechanism(nn.Module):
         wrong = sorted(set(values) ^ set(names))
         if wrong:
             raise InputError(f"mechanism '{self.name}' has the parameters {', '.join(names)}; check {', '.join(wrong)}")
-        self.nominal.copy_(torch.tensor([float(values[n]) for n in names], dtype=torch.float64))
+        self.nominal.copy_(self.nominal.new_tensor([float(values[n]) for n in names]))
         self._follow_nominal()
 
 
