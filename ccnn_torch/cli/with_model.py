@@ -125,6 +125,7 @@ def compensate(
             raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
     with if_stopped(NOTHING_WRITTEN):
         from ccnn_torch.compensation.job import compensate_table, is_of_motion
+        from ccnn_torch.compensation.model_files.load import load_compensation
 
         refused = ""
         if is_of_motion(model):
@@ -139,12 +140,13 @@ def compensate(
             frames = [
                 None if text is None else _numbers(text, f"--{o}") for o, text in (("tool", tool), ("base", base))
             ]
+            loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
             if program:
                 from ccnn_torch.compensation.programs.job import compensate_program
 
-                said, refused = compensate_program(model, input, output, public_key, allow_code, *frames)
+                said, refused = compensate_program(loaded, input, output, allow_code, *frames)
             else:
-                said, refused = compensate_table(model, input, output, pose, back, sd, public_key, allow_code, *frames)
+                said, refused = compensate_table(loaded, input, output, pose, back, sd, allow_code, *frames)
     if not quiet:
         from ccnn_torch.report.screen import say
 

@@ -213,7 +213,8 @@ def observability(jacobian: Tensor, poses: int | Tensor | None = None) -> Tensor
     if m < k:
         jacobian = torch.cat([jacobian, jacobian.new_zeros(*jacobian.shape[:-2], k - m, k)], dim=-2)
     count = torch.as_tensor(m if poses is None else poses, dtype=jacobian.dtype)
-    return torch.linalg.svdvals(jacobian).log().mean(-1).exp() / count.sqrt()
+    mean: Tensor = torch.linalg.svdvals(jacobian).log().mean(-1).exp()
+    return mean / count.sqrt()
 
 
 @dataclass(frozen=True)

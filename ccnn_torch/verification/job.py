@@ -27,12 +27,10 @@ from ccnn_torch.mechanisms import (
     SerialArm,
     as_measured,
     load_mechanism,
-    mechanism_from_description,
 )
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, rigid_body_frame
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
-from ccnn_torch.plugins import code_refused
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.commanded import SECOND
@@ -80,8 +78,7 @@ def nominal_mechanism(
     if spec is None:
         if model.machine is not None:
             return model.machine.nominal
-        with code_refused(f"{model.path}: its mechanism", allow_code):
-            return mechanism_from_description(about, allow_code=True)
+        return model.mechanism(allow_code)
     shown = load_mechanism(spec, **(keys or {}))
     given = inside(shown)
     if isinstance(given, SerialArm) and len(about["pose"]) == 3:

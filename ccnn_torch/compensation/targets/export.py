@@ -25,7 +25,7 @@ from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.display import plain
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
+from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
 
@@ -82,10 +82,9 @@ class _Order:
     def mechanism(self) -> Mechanism:
         if self.model.machine is not None:
             return self.model.machine.identified
-        described = self.model.facts["mechanism"]
-        if "spec" not in described:
+        if "spec" not in self.model.facts["mechanism"]:
             raise ModelFileError(f"{self.path}: this target needs the machine's kinematics, which the model lacks")
-        return mechanism_from_description(described, self.allow_code)
+        return self.model.mechanism(self.allow_code)
 
 
 def _linuxcnc(order: _Order) -> dict[str, str]:
