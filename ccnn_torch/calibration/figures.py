@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ccnn_torch.calibration.page import run_page, write_tables
 from ccnn_torch.display import count_text
-from ccnn_torch.errors import InputError
 from ccnn_torch.evolution.network import alive_nodes as path_nodes
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
 from ccnn_torch.report.figures import (
@@ -26,9 +25,7 @@ from ccnn_torch.report.figures import (
     bare,
     inline_figures,
     joint_error_plot,
-    overview_plot,
     pose_error_plot,
-    save_figure,
     styled,
     workspace_plot,
 )
@@ -226,22 +223,3 @@ def run_plots(folder: str | Path, results: RunResults) -> list[Plot]:
     for method, history in histories.items():
         plots.append(convergence_plot(history, method, unit=unit, **lines))
     return [plot for plot in plots if plot is not None]
-
-
-def make_picture(folder: str | Path, path: str | Path, joint: str | None = None) -> str:
-    """Draw the one wide picture of a run: joint error and workspace, before and after.
-
-    Args:
-        path: where to write; `.png` and `.svg` are both written.
-        joint: name of the joint shown; by default the one with the largest error.
-
-    Returns:
-        The caption.
-    """
-    arrays = load_arrays(folder)
-    names = [j.name for j in arrays.joints]
-    if joint is not None and joint not in names:
-        raise InputError(f"There is no joint {joint!r}; this run has {', '.join(names)}.")
-    plot = overview_plot(arrays, None if joint is None else names.index(joint))
-    save_figure(plot.figure, path)
-    return plot.caption

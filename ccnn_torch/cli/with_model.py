@@ -1,4 +1,4 @@
-"""Commands on the file of a model: compensate, export, verify, sign; and on a folder: report, picture."""
+"""Commands on the file of a model: compensate, export, verify, sign; and on a folder: report."""
 
 from __future__ import annotations
 
@@ -380,23 +380,3 @@ def report(
         webbrowser.open(page.resolve().as_uri())
     if not quiet:
         typer.echo(page)
-
-
-def picture(
-    run_dir: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
-    out: Annotated[Path, typer.Argument(help="Where to write; a .png and a .svg are made.")],
-    joint: Annotated[str | None, typer.Option(help="Joint to show; by default the one with the largest error.")] = None,
-    quiet: Quiet = False,
-) -> None:
-    """Draw a joint's error and the pose error over the workspace, before and after compensation.
-
-    Example:
-
-    ccnn picture runs/tripod docs/picture.png --joint q3
-    """
-    from ccnn_torch.calibration.figures import make_picture
-    from ccnn_torch.report.screen import say
-
-    caption = make_picture(run_dir, out, joint)
-    if not quiet:
-        say(caption)

@@ -284,45 +284,12 @@ def workspace_plot(arrays: RunArrays) -> Plot | None:
         None when the machine moves along one line only.
     """
     place, before, after, where = _map_data(arrays)
-    planes = planes_of(place, arrays.axes)
-    if not planes:
+    if not planes_of(place, arrays.axes):
         return None
-    shapes = [height_of(place, arrays.axes, plane) for plane in planes]
-    figure = Figure(figsize=(9.2, sum(3.6 * shape + 0.85 for shape in shapes)), layout="constrained")
-    grid = figure.subplots(len(planes), 2, squeeze=False, height_ratios=shapes)
-    rms_text = draw_pairs(figure, grid, arrays.axes, planes, place, before, after)
+    figure, rms_text = maps(arrays.axes, place, before, after)
     return Plot(
         "workspace", figure, f"Position error over the workspace {where}, before and after on one scale: {rms_text}."
     )
-
-
-@styled
-def overview_plot(arrays: RunArrays, joint: int | None = None) -> Plot:
-    """One wide picture of a run: a joint's error against the noise floor, and the workspace before and after.
-
-    Args:
-        arrays: of one repeat.
-        joint: which joint; by default the one with the largest error before.
-    """
-    if joint is None:
-        joint = int(np.argmax(np.abs(arrays.measured).max(0)))
-    place, before, after, where = _map_data(arrays)
-    planes = planes_of(place, arrays.axes)[:1]
-    shape = height_of(place, arrays.axes, planes[0]) if planes else 1.0
-    # The maps take the width that their shape needs at this height; the joint's panel takes the rest.
-    wide = float(np.clip(1 / shape, 0.7, 1.4))
-    figure = Figure(figsize=(6.5 + 6.2 * wide if planes else 8.2, 4.0), layout="constrained")
-    grid = figure.subplots(1, 3 if planes else 1, width_ratios=(1.8, wide, wide) if planes else (1,), squeeze=False)
-    left = grid[0, 0]
-    draw_joint_error(left, arrays, joint)
-    left.set_xlabel("row of the records")
-    left.set_title(f"Joint {arrays.joints[joint].name}", pad=26)
-    left.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, handletextpad=0.3, columnspacing=1.2)
-    caption = f"Error of joint {arrays.joints[joint].name} before and after compensation"
-    if planes:
-        rms_text = draw_pairs(figure, grid[:, 1:], arrays.axes, planes, place, before, after)
-        caption += f" (left), and position error over the workspace {where}: {rms_text}"
-    return Plot("overview", figure, caption + ".")
 
 
 def _map_data(arrays: RunArrays) -> tuple[Array, Array, Array, str]:
@@ -340,7 +307,7 @@ def planes_of(place: Array, axes: tuple[Coordinate, ...]) -> list[tuple[int, int
     return [(moving[0], other) for other in moving[1:3]]
 
 
-def height_of(place: Array, axes: tuple[Coordinate, ...], plane: tuple[int, int]) -> float:
+def _height_of(place: Array, axes: tuple[Coordinate, ...], plane: tuple[int, int]) -> float:
     """Height of a map over its width."""
     across, up = plane
     if axes[across].unit != axes[up].unit:
@@ -348,11 +315,8 @@ def height_of(place: Array, axes: tuple[Coordinate, ...], plane: tuple[int, int]
     return float(np.clip(np.ptp(place[:, up]) / np.ptp(place[:, across]), 0.25, 1.6))
 
 
-def draw_pairs(
-    figure: Figure,
-    grid: Any,
+def maps(
     axes: tuple[Coordinate, ...],
-    planes: list[tuple[int, int]],
     place: Array,
     before: Array,
     after: Array,
@@ -360,8 +324,16 @@ def draw_pairs(
     titles: tuple[str, str] = ("Before", "After"),
     quantity: str = "position error",
     si_unit: str = "m",
-) -> str:
-    """Fill a grid of `planes` lines and two columns, add the colour bar; returns the RMS values as text."""
+) -> tuple[Figure, str]:
+    """Values `s` over places `s x d` before and after, a line of two maps for each of `planes_of`, on one scale.
+
+    Returns:
+        the figure, and the RMS values as text.
+    """
+    planes = planes_of(place, axes)
+    shapes = [_height_of(place, axes, plane) for plane in planes]
+    figure = Figure(figsize=(9.2, sum(3.6 * shape + 0.85 for shape in shapes)), layout="constrained")
+    grid = figure.subplots(len(planes), 2, squeeze=False, height_ratios=shapes)
     scale, unit = display_unit(si_unit, float(np.median(before)))
     norm = _norm(before / scale, after / scale)
     drawn: Any = None
@@ -376,7 +348,7 @@ def draw_pairs(
         bar.ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         bar.ax.yaxis.set_minor_locator(NullLocator())
-    return f"RMS {number_text(_rms(before) / scale, 3)} → {number_text(_rms(after) / scale, 3)} {unit}"
+    return figure, f"RMS {number_text(_rms(before) / scale, 3)} → {number_text(_rms(after) / scale, 3)} {unit}"
 
 
 def _norm(before: Array, after: Array) -> Normalize:

@@ -1,4 +1,4 @@
-"""Tables, CSV, HTML, TensorBoard and the picture command, read back and compared with the numbers they came from."""
+"""Tables, CSV, HTML, and TensorBoard, read back and compared with the numbers they came from."""
 
 from __future__ import annotations
 
@@ -12,18 +12,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import typer
 from PIL import Image
 from report_runs import arm_run, tripod_run
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from typer.testing import CliRunner
 
 from ccnn_torch.calibration.callbacks import EventFile, TensorBoardCallback, tags_of
-from ccnn_torch.calibration.figures import make_picture, write_report
+from ccnn_torch.calibration.figures import write_report
 from ccnn_torch.calibration.page import long_table, result_tables, run_page, verdict, worse_text
 from ccnn_torch.calibration.statistics import spread
-from ccnn_torch.cli.with_model import picture
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.results.run import RmsMax, RunResults
@@ -256,16 +253,3 @@ def test_errors_stand_against_the_time_too_and_outlive_a_resume(tmp_path: Path) 
     assert [s.step for s in found] == list(range(1, 21))
     assert [s.value for s in found] == pytest.approx(error.mean(1).tolist(), rel=1e-6)
     assert found[19].wall_time - found[12].wall_time == pytest.approx(0.35, abs=1e-3)
-
-
-def test_the_picture_command(run_folder: Path) -> None:
-    app = typer.Typer()
-    app.command()(picture)
-    target = run_folder / "docs" / "picture.png"
-    done = CliRunner().invoke(app, [str(run_folder), str(target), "--joint", "q2"])
-    assert done.exit_code == 0 and "joint q2" in done.output
-    with Image.open(target) as drawn:
-        width, height = drawn.size
-    assert width > 2.5 * height and width >= 1500
-    with pytest.raises(InputError, match="no joint 'q9'; this run has q1, q2, q3"):
-        make_picture(run_folder, target, "q9")

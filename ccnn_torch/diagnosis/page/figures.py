@@ -25,8 +25,7 @@ from ccnn_torch.report.figures import (
     RASTER_ABOVE,
     SERIES,
     Plot,
-    draw_pairs,
-    height_of,
+    maps,
     planes_of,
     styled,
 )
@@ -312,22 +311,8 @@ def remainder_map(arrays: Arrays, about: About) -> Plot | None:
     place, before, after = place[known], before[known], after[known]
     if not len(before) or not before.max() > 0:
         return None
-    planes = planes_of(place, axes)
-    shapes = [height_of(place, axes, plane) for plane in planes]
-    figure = Figure(figsize=(9.2, sum(3.6 * shape + 0.85 for shape in shapes)), layout="constrained")
-    grid = figure.subplots(len(planes), 2, squeeze=False, height_ratios=shapes)
-    text = draw_pairs(
-        figure,
-        grid,
-        axes,
-        planes,
-        place,
-        before,
-        after,
-        titles=("Model as it is", "What the verdict leaves"),
-        quantity=quantity,
-        si_unit=unit,
-    )
+    titles = "Model as it is", "What the verdict leaves"
+    figure, text = maps(axes, place, before, after, titles=titles, quantity=quantity, si_unit=unit)
     which = "rows not used for fitting" if (held & ~aside).any() else "rows"
     caption = f"The {quantity} over the {over}, on {len(before)} {which}, on one scale: {text}. A pattern that is left "
     return Plot("map", figure, caption + "on the right is not explained; noise has none.")
