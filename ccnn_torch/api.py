@@ -151,4 +151,4 @@ def since(
         InputError: the model or the rows cannot be used; the sentence says what to change.
     """
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
-    return what_changed(loaded, records, mechanism, allow_code=allow_code, seed=seed)
+    return what_changed(loaded, records, mechanism, allow_code=allow_code, seed=seed)[0]

@@ -227,6 +227,8 @@ def _kind(unit: str) -> str | None:
         return None
 
 
+# Bytes in which a program says what it is; beyond this length no vector is a rotation vector, rounding aside [rad].
+_HEAD, _VECTOR = 4096, 1.01 * np.pi
 Ask = Callable[[str], str]
 _ORIENTATION = {"rx": "a rotation vector, as Universal Robots gives it", "kuka_a": "KUKA's A, B, C (Rz Ry Rx)",
                 "fanuc_w": "Fanuc's W, P, R (fixed axes x, y, z)", "staubli_rx": "Stäubli's Rx, Ry, Rz",
@@ -267,13 +269,14 @@ def starter_config(
         )
     machine, name, why = _machine(found, table, mechanism, ask)
     columns = _columns(found, table, machine, units, ask)
+    columns, why_turned = _turned(columns, table, records)
     split, reason = _split(found, table, columns)
     lines = [
         _plain(f"# Written by `ccnn new` for {records.name}, {len(table)} rows: check what it guessed."),
         "# `ccnn keys` lists every key.",
         f"records: {json.dumps(_relative(records, out), ensure_ascii=False)}",
         *_mechanism_lines(name, why, out),
-        *_column_lines(columns, found, table),
+        *_column_lines(columns, found, table, why_turned),
         *(["# No joints: they are the nominal inverse kinematics of the commanded pose."] if found.goals else []),
         *_count_lines(columns, found, table, machine, records),
         *(form.config if form and form.config else [f"split: {split}   # {reason}"]),
@@ -356,6 +359,29 @@ def _columns(
     }
 
 
+def _turned(columns: dict[str, str], table: Table, records: Path) -> tuple[dict[str, str], str]:
+    """Rx, Ry, Rz as angles about fixed axes where the file or its values say that they are no rotation vector; why.
+
+    SpatialAnalyzer's are such unless another convention was chosen there.
+    """
+    named = {ours.partition("[")[0]: name for name, ours in columns.items()}
+    if not {"rx", "ry", "rz"} <= named.keys():
+        return columns, ""
+    names = [named[axis] for axis in ("rx", "ry", "rz")]
+    turns = np.stack([to_si(table.raw(n), columns[n].rpartition("[")[2].rstrip("]"), where=n) for n in names], -1)
+    largest = float(np.nanmax(np.linalg.norm(turns, axis=-1), initial=0.0))
+    with records.open("rb") as file:
+        theirs = re.search(rb"spatial\s*analyzer|new river kinematics", file.read(_HEAD), re.IGNORECASE)
+    if theirs:
+        why = f"the file is of {theirs[0].decode()}, whose usual convention this is"
+    elif largest > _VECTOR:
+        why = f"a rotation vector is not longer than 180 deg, and here it would be {np.degrees(largest):.0f} deg"
+    else:
+        return columns, ""
+    fixed = dict(zip(names, EULER_ANGLES["fanuc"][0], strict=True))
+    return {n: ours if n not in fixed else f"{fixed[n]}[{ours.partition('[')[2]}" for n, ours in columns.items()}, why
+
+
 def _split(found: Recognised, table: Table, columns: dict[str, str]) -> tuple[str, str]:
     """Split as YAML and why."""
     places = [name for name, ours in found.meaning.items() if ours in ("x", "y", "z")]
@@ -389,12 +415,20 @@ def _dimension_lines(name: str) -> list[str]:
     return ["# Its dimensions [m, rad]; write those of your machine:", f"# mechanism_keys: {{{', '.join(sizes)}}}"]
 
 
-def _column_lines(columns: dict[str, str], found: Recognised, table: Table) -> list[str]:
-    """The map of columns, without those that need no entry; a covariate without unit is left out."""
+def _column_lines(columns: dict[str, str], found: Recognised, table: Table, why: str) -> list[str]:
+    """The map of columns, without those that need no entry; a covariate without unit is left out.
+
+    why: Rx, Ry, Rz are taken for angles about fixed axes.
+    """
     targets = {**columns, **found.inputs}
     needed = {table.header(name): target for name, target in targets.items() if table.header(name) != target}
     bare = [name for name in found.unknown if is_covariate(name) and not table.units[name]]
     lines = [f"# Orientation: {text}." for name, text in _ORIENTATION.items() if name in found.pose]
+    if why:
+        lines = [
+            f"# Orientation: angles about the fixed axes x, y, z in turn: {why}.",
+            "# For another one write rx, ry, rz (a rotation vector) below columns, or names of docs/how_to/records.md.",
+        ]
     if not needed and not bare:
         return lines
     entries = [f"  {_quoted(header)}: {json.dumps(target, ensure_ascii=False)}" for header, target in needed.items()]

@@ -41,6 +41,8 @@ FACTORIES: dict[str, Callable[[], Learner]] = {
                 "refinement_iterations": 2,
                 "refine_every": 2,
                 "members": 2,
+                "rival_hidden": (2,),
+                "waves": 4,
                 "wave_searches": 1,
             }
         )

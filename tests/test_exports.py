@@ -121,6 +121,26 @@ def test_a_config_of_an_export_runs(tmp_path: Path, cli: Cli, name: str, text: s
 
 
 @pytest.mark.parametrize(
+    ("above", "turn", "said", "named"),
+    [
+        ("Report of a tracker", 50, "a rotation vector, as Universal Robots gives it", '"Rz": "rz[degrees]"'),
+        ("Report of a tracker", 170, "a rotation vector is not longer than 180 deg", '"Rz": "fanuc_r[degrees]"'),
+        ("SpatialAnalyzer 2023.2", 50, "the file is of SpatialAnalyzer, whose usual", '"Rz": "fanuc_r[degrees]"'),
+    ],
+)
+def test_what_three_angles_are_is_told_with_its_reason(
+    tmp_path: Path, cli: Cli, above: str, turn: float, said: str, named: str
+) -> None:
+    names = ",".join([*(f"J{k + 1}" for k in range(6)), "X", "Y", "Z", "Rx", "Ry", "Rz"])
+    rows = [",".join(f"{v:.3f}" for v in [*row[:9], turn, 30 + k, turn]) for k, row in enumerate(arm(20))]
+    text = "\n".join([above, "Units: Millimeters, Degrees", "", names, *rows, ""])
+    config = tmp_path / "robot.yaml"
+    code, _, error = cli("new", write(tmp_path / "poses.txt", text), "--mechanism", ARM, "--out", config)
+    told = config.read_text(encoding="utf-8") if code == 0 else error
+    assert said in told and named in told, told
+
+
+@pytest.mark.parametrize(
     ("change", "said"),
     [
         (lambda t: t.replace("Cycle\tX\tY\tZ", "Cycle\tX\tY\tRz", 1), "has other columns than that from line"),

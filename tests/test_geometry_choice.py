@@ -55,14 +55,16 @@ def test_what_geometry_leaves_is_learned(tmp_path: Path) -> None:
 
 def test_held_out_rows_do_not_choose(tmp_path: Path) -> None:
     """The figures of the choice are the same whatever the test rows hold."""
-    first = _prepared(tmp_path, 3e-4, 1e-4)
+    keys = {"effects": ["joint_gain"]}
+    first = _prepared(tmp_path, 3e-4, 1e-4, **keys)
     lines = (tmp_path / "rows.csv").read_text().splitlines()
     for row in first.dataset.splits[0].test.tolist():
         cells = lines[row + 1].split(",")
         cells[3] = repr(float(cells[3]) + 1e-3)
         lines[row + 1] = ",".join(cells)
     (tmp_path / "rows.csv").write_text("\n".join(lines))
-    assert prepare(RunConfig.from_keys(records=str(tmp_path / "rows.csv"), mechanism="tripod")).choice == first.choice
+    again = prepare(RunConfig.from_keys(records=str(tmp_path / "rows.csv"), mechanism="tripod", **keys))
+    assert again.choice == first.choice and again.choice.by == "folds"
 
 
 def test_an_explicit_word_is_kept(tmp_path: Path) -> None:

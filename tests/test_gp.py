@@ -125,30 +125,39 @@ def test_slopes_are_those_of_finite_differences(kernel: str) -> None:
         torch.testing.assert_close(slope[:, k], difference, rtol=1e-6, atol=1e-7)
 
 
-def test_steps_are_those_of_rprop_with_one_step_size_a_number() -> None:
-    data, settings = wavy(1, 15), GPSettings(tolerance=0.0)
+def test_steps_are_those_of_bfgs() -> None:
+    """Each output against BFGS as the textbook has it, trial by trial."""
+    data, settings = wavy(1, 8, seed=1), GPSettings(tolerance=0.0, learning_rate=1.0)
     learner = GaussianProcess(settings)
     learner.start(data)
-    theta = [[float(v) for v in row] for row in learner.state_dict()["theta"][0]]
-    sizes, before = [[[start] * 5 for _ in theta] for start in (settings.learning_rate, 0.0)]
-    turned = 0
-    for _ in range(25):
-        targets = data.targets[0].mT
-        at = torch.tensor(theta, dtype=torch.float64)
-        rows = data.inputs.expand(2, -1, -1)
-        slopes = log_evidence(settings.kernel, FLOOR, at, rows, targets, data.weights.expand(2, -1)).slope.tolist()
-        for o, row in enumerate(slopes):
-            for k, slope in enumerate(row):
-                same = slope * before[o][k]
-                factor = 1.2 if same > 0 else 0.5 if same < 0 else 1.0
-                sizes[o][k] = min(max(sizes[o][k] * factor, 1e-4), 1.0)
-                # Where the slope has changed its sign it stays, and the next step is of the size that it has.
-                before[o][k] = 0.0 if same < 0 else slope
-                theta[o][k] += math.copysign(sizes[o][k], slope) * (before[o][k] != 0)
-                turned += same < 0
+    start, shortened = learner.state_dict()["theta"][0].numpy(), 0
+    taken = [(row, -math.inf, np.zeros(5), np.eye(5), 1.0) for row in start]
+    trials = list(start)
+    for number in range(15):
+        for o, (at, value, slope, inverse, length) in enumerate(taken):
+            given = torch.from_numpy(trials[o])[None], data.inputs, data.targets[..., o], data.weights
+            found = log_evidence(settings.kernel, FLOOR, *given)
+            new, rise, step = float(found.value), found.slope[0].numpy(), trials[o] - at
+            if new < value + 1e-4 * slope @ step:
+                length *= 0.3
+                shortened += 1
+            else:
+                change = slope - rise
+                if number == 0:
+                    inverse = np.eye(5) * settings.learning_rate / abs(rise).max()
+                elif step @ change > 1e-10 * change @ change:
+                    curvature = step @ change
+                    if np.array_equal(inverse, inverse[0, 0] * np.eye(5)):
+                        inverse = np.eye(5) * curvature / (change @ change)
+                    project = np.eye(5) - np.outer(step, change) / curvature
+                    inverse = project @ inverse @ project.T + np.outer(step, step) / curvature
+                at, value, slope, length = trials[o], new, rise, 1.0
+            taken[o] = at, value, slope, inverse, length
+            way = inverse @ slope
+            trials[o] = at + length * way / max(1.0, abs(way).max())
         learner.step()
-        np.testing.assert_allclose(learner.state_dict()["theta"][0], theta, rtol=0, atol=1e-9)
-    assert turned > 5
+        np.testing.assert_allclose(learner.state_dict()["theta"][0], trials, rtol=0, atol=1e-7)
+    assert shortened > 0
 
 
 def test_a_row_of_weight_two_is_that_row_twice() -> None:

@@ -102,6 +102,13 @@ def test_what_was_measured_is_where_the_nozzle_was(tmp_path: Path) -> None:
     np.testing.assert_allclose([nozzle(row[:3])[2] for row in printer.heights], printer.heights[:, 3], atol=1e-4)
     told = [np.linalg.norm(nozzle(row[:3]) - nozzle(row[3:6])) for row in printer.distances]
     np.testing.assert_allclose(told, printer.distances[:, 6], atol=0.011)
+    # Parts of it in files that it includes, some of them by a pattern.
+    lines = saved().splitlines()
+    (tmp_path / "steppers").mkdir()
+    (tmp_path / "steppers" / "all.cfg").write_text("\n".join(lines[:5]))
+    path.write_text("\n".join(["[include steppers/*.cfg]  # of the board", *lines[5:]]) + "\n" + analyzed())
+    apart = read_printer(path)
+    assert apart is not None and np.array_equal(apart.heights, printer.heights)
     # The same as Klipper keeps them, as steps.
     steps = [(TOP - row[k : k + 3]) / STEP for row in printer.distances for k in (0, 3)]
     kept = [f"#*# distance{i // 2}_pos{i % 2 + 1} = {','.join(f'{v:.3f}' for v in s)}" for i, s in enumerate(steps)]
@@ -151,6 +158,8 @@ def test_from_printer_cfg_to_lines_for_printer_cfg(tmp_path: Path, cli: Cli) -> 
         (lambda t: t.replace("arm_length: 250.0", "arm_length: long"), "[stepper_a] arm_length: must be 1 number(s)"),
         (lambda t: t.replace("gear_ratio: 4:1, 1:2", "gear_ratio: 4:0"), "must be above 0"),
         (lambda t: t.replace("height3_pos = ", "height3_pos = 1e999,"), "height3_pos: must be 3 number(s)"),
+        (lambda t: "[include mcu.cfg]\n" + t, "[include mcu.cfg]: there is no such file beside it"),
+        (lambda t: "[include printer.cfg]\n" + t, "printer.cfg: includes itself"),
         (lambda t: t + "# DELTA_ANALYZE CENTER_DISTS=1,2,3,4,5,6\n", "DELTA_ANALYZE lacks CENTER_PILLAR_WIDTHS"),
         (lambda t: t + analyzed().replace("_DISTS=", "_DISTS=1,"), "DELTA_ANALYZE CENTER_DISTS: must be 6 number(s)"),
     ],

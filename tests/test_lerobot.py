@@ -102,12 +102,31 @@ def test_which_episodes_and_joints(tmp_path: Path, episodes: list[Episode]) -> N
 
 def test_names_are_optional(tmp_path: Path, episodes: list[Episode]) -> None:
     shape = {"shape": [len(JOINTS)], "names": None}
+    nested = {"shape": [len(JOINTS)], "names": [["d", "e", "f"]]}
     grouped = {"shape": [len(JOINTS)], "names": {"motors": ["a", "b", "c"]}}
-    for own, names in ((shape, "q1 is joint_1, q2 is joint_2"), (grouped, "q1 is a, q2 is b, q3 is c")):
+    for own, names in (
+        (shape, "q1 is joint_1, q2 is joint_2"),
+        (grouped, "q1 is a, q2 is b, q3 is c"),
+        (nested, "q1 is d, q2 is e"),
+    ):
         # Of both kinds the order tells which belong together.
         root = write(tmp_path / names[6:9].strip(), episodes, **{"observation.state": own})
         (log, *_) = load_logs([root], keys={"units": "deg"})
         assert names in log.notes[0] and log.command.shape[1] == len(JOINTS)
+
+
+def test_efforts_and_velocities_are_read_where_their_unit_is_said(tmp_path: Path, episodes: list[Episode]) -> None:
+    feature = {"dtype": "float32", "shape": [len(JOINTS)], "names": None}
+    root = write(tmp_path / "set", episodes, **{"observation.effort": feature})
+    for file in root.glob("data/*/*"):
+        table = pq.read_table(file)
+        pq.write_table(table.append_column("observation.effort", table["action"]), file)
+    (log, *_) = load_logs([root], keys={"units": "deg"})
+    assert any("observation.effort left out; motion_keys={effort: UNIT}" in note for note in log.notes)
+    (log, *_) = load_logs([root], keys={"units": "deg", "effort": "mA"})
+    np.testing.assert_allclose(log.beside["current2"], 1e-3 * episodes[0][1][:, 1], atol=1e-7)
+    refused(root, "effort: write one of N*m, A, mA, 1, not Nm", units="deg", effort="Nm")
+    refused(root, "velocity: ", "has no observation.velocity", units="deg", velocity="deg/s")
 
 
 def test_units_are_told_by_the_values_or_by_the_user(tmp_path: Path, episodes: list[Episode]) -> None:

@@ -45,9 +45,8 @@ def test_the_config_of_new_goes_into_every_command(config: Path, tmp_path: Path,
     ):
         code, out, err = cli(*words)
         assert code in ((0, 1) if words[0] == "verify" else (0,)), (words, out, err)
-        unused = {"check": "split", "diagnose": "split", "identify": "split.validation", "verify": "split"}
-        said = f"robot.yaml: {unused.get(words[0], '')} is a key of ccnn run and is not used here."
-        assert (said in out) is (words[0] in unused and "--quiet" not in words), (words, out)
+        # How ccnn run splits the rows is nothing that a user of the others has to be told.
+        assert "not used here" not in out, (words, out)
 
 
 def test_options_stand_for_keys(config: Path, tmp_path: Path, cli: Cli) -> None:
@@ -79,7 +78,7 @@ def test_what_no_command_knows_is_refused_with_the_nearest_key(
 ) -> None:
     notes: list[str] = []
     load(config, (), notes.append)
-    assert len(notes) == 1
+    assert "split" not in " ".join(notes).removeprefix(str(config))
     text = config.read_text()
     config.write_text(text.replace("split:", "splt:"))
     with pytest.raises(Exception, match="there is no key 'splt'; did you mean 'split'"):

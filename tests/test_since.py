@@ -129,7 +129,8 @@ def test_the_command_and_its_files(
     assert code == 0 and "zero offset of q3 by +" in " ".join(out.split()), err
     found = json.loads((tmp_path / "now" / "since.json").read_text())
     assert found["changed"][0]["name"] == "joint_offset q3"
-    assert "joint_offset" not in (tmp_path / "now" / "since.html").read_text()
+    page = (tmp_path / "now" / "since.html").read_text()
+    assert "joint_offset" not in page and page.index('id="machine"') < page.index("What changed?")
     monkeypatch.setattr("webbrowser.open", lambda page: True)
     assert cli("report", "now")[0] == 0
     assert (tmp_path / "now" / "next_measurements.csv").read_text().startswith("q1[deg],q2[deg],q3[deg],gain[1]")

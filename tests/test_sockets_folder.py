@@ -51,6 +51,15 @@ def test_from_a_folder_to_an_identified_arm(tmp_path: Path, cli: Cli) -> None:
     assert code == 0, error
     position = json.loads((tmp_path / "run" / "identified.json").read_text())["methods"]["lm"]["test"]["position"]
     assert position["after"] < 0.2 * position["before"]
+    # The plate somewhere else, as many rows as a plate is left for; then joint 3 was mounted anew.
+    for hole in (0, 1):
+        (tmp_path / "later").mkdir(exist_ok=True)
+        there = np.loadtxt(folder(tmp_path / f"all{hole}", 2) / "place_1" / f"hole_{hole}.csv", delimiter=",")
+        np.savetxt(tmp_path / "later" / f"hole_{hole}.csv", there - [0, 0, 2e-3, 0, 0, 0], delimiter=",")
+    code, out, error = cli(
+        "diagnose", "--since", tmp_path / "run" / "identified.yaml", tmp_path / "later", "--out", tmp_path / "now"
+    )
+    assert code == 0 and "zero offset of q3 by +" in out, (out, error)
 
 
 @pytest.mark.parametrize(

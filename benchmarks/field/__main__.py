@@ -90,7 +90,7 @@ def _is_in(name: str, kind: set[str], wanted: Sequence[str]) -> bool:
 
 def _said(found: dict[str, Any]) -> str:
     if "position" in found:
-        return f"{1e6 * found['position']:.0f} um in {found['seconds']:.1f} s"
+        return f"{1e6 * found['position']:.0f} um in {found['seconds']:.1f} s of processor time"
     return str(found.get("failed", ", ".join(f"{c}: {v['named']}" for c, v in found.get("causes", {}).items())))
 
 

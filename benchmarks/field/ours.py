@@ -1,4 +1,4 @@
-"""ccnn_torch with its defaults: `calibrate`, and predictions of the written model file; sockets by `identify`."""
+"""ccnn_torch with its defaults: `calibrate`, and predictions of the written model file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import torch
 from benchmarks.field.protocol import Fit, Floats, Rows
 from ccnn_torch import api
 from ccnn_torch.compensation import load_model
-from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import dump_yaml, read_yaml
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.records import write_table
@@ -35,30 +34,24 @@ def write(rows: Rows, path: Path) -> str:
     columns |= {f"{n}[{_UNIT[n[0]]}]": c for n, c in zip(rows.names, rows.covariates.T, strict=True)}
     if rows.several:
         columns["placement[1]"] = rows.frame.astype(np.float64)
-    if rows.sockets:
-        columns["socket[1]"] = np.unique(rows.poses, axis=0, return_inverse=True)[1].reshape(-1).astype(np.float64)
     write_table(path, columns)
     return str(path)
 
 
 def machine_file(rows: Rows, folder: Path) -> str:
-    """The maker's table as it stands; the rows are of one arm, and a sockets' plate is named by the constraint."""
-    content = read_yaml(rows.nominal)
+    """The maker's table as it stands; the rows are of one arm, with a base frame for each measuring frame."""
+    content = {k: v for k, v in read_yaml(rows.nominal).items() if k not in ("frame_per", "tool_per")}
+    if rows.several:
+        content |= {"base_frame": "unknown", "frame_per": ["placement"]}
     path = folder / "machine.yaml"
-    path.write_text(dump_yaml({k: v for k, v in content.items() if k not in ("frame_per", "tool_per")}), "utf-8")
+    path.write_text(dump_yaml(content), "utf-8")
     return str(path)
 
 
 def ours(rows: Rows) -> Fit:
     """The best of geometry, effects and network by cross-validation on the training rows."""
-    if rows.several and not rows.sockets:
-        raise InputError("a model file of ours holds one measuring frame; rows of several are for ccnn identify")
     with tempfile.TemporaryDirectory() as folder:
         file, nominal = write(rows, Path(folder) / "rows.csv"), machine_file(rows, Path(folder))
-        if rows.sockets:
-            keys = {"kind": "sockets", "by": ["placement"]}
-            arm = api.identify(records=file, mechanism=nominal, constraint=keys).mechanism()
-            return Fit(lambda joints, covariates: _poses(arm, torch.from_numpy(joints)))
         api.calibrate(records=file, mechanism=nominal).save(folder, forms=())
         model = load_model(Path(folder) / "model.safetensors")
     machine = nominal_mechanism(model, None, allow_code=False)

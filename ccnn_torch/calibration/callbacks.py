@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import itertools
+import math
 import os
 import socket
+import statistics
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -135,16 +137,16 @@ def tags_of(name: str, value: Tensor | float) -> dict[str, float]:
             tag = f"{group}/{rest}_{part}" if rest else f"{group}/{part}"
         else:
             tag = f"{group}/{rest}" if rest else f"training/{name}"
-        column = table[:, k]
-        finite = column[column.isfinite()]
-        if len(finite):
-            tags[tag] = float(torch.quantile(finite, 0.5))
-        if repeats > 1 and bool(column[0].isfinite()):
-            tags[f"repeat_0/{tag}"] = float(column[0])
+        # In plain numbers: a call of torch or numpy takes longer than the median of a few repeats.
+        finite = [number for number in table[:, k].tolist() if math.isfinite(number)]
+        if finite:
+            tags[tag] = statistics.median(finite)
+        if repeats > 1 and math.isfinite(first := float(table[0, k])):
+            tags[f"repeat_0/{tag}"] = first
     return tags
 
 
-_numbers = itertools.count()
+_files = itertools.count()
 
 
 class EventFile:
@@ -173,7 +175,7 @@ class EventFile:
         self.failed: str | None = None
         # TensorBoard reads the files of a folder in the order of their names, and two may begin within a second.
         seconds, rest = divmod(time.time_ns(), 1_000_000_000)
-        name = f"events.out.tfevents.{seconds:010}.{rest:09}.{socket.gethostname()}.{os.getpid()}.{next(_numbers):06}"
+        name = f"events.out.tfevents.{seconds:010}.{rest:09}.{socket.gethostname()}.{os.getpid()}.{next(_files):06}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._file = io.FileIO(folder / name, "w")

@@ -36,6 +36,7 @@ class Outcome:
         compensators: of every repeat of measured records; () of a simulated machine, and where `without` says why
             there is none.
         damped: share of the rows at which the command is damped near a singular pose or at a limit [1].
+        left: position and rotation vector of `after`, `r x s x c` [m, rad]; None of a simulated machine.
     """
 
     fitted: Fitted
@@ -47,6 +48,7 @@ class Outcome:
     compensators: tuple[Compensator, ...] = ()
     without: str = ""
     damped: float = 0.0
+    left: Tensor | None = None
 
 
 def pose_before(prepared: Prepared) -> PoseError:
@@ -57,8 +59,18 @@ def pose_before(prepared: Prepared) -> PoseError:
     """
     if prepared.simulation is not None:
         return prepared.simulation.pose_errors(prepared.joints)[0]
-    nominal = prepared.mechanism.forward_kinematics(prepared.joints, prepared.parameters, _given(prepared))
-    return prepared.mechanism.pose_error(prepared.pose, nominal)
+    return prepared.mechanism.pose_error(prepared.pose, _nominal(prepared))
+
+
+def place_and_error(prepared: Prepared, repeat: int) -> tuple[Tensor, Tensor]:
+    """Measured position, and its difference from the nominal machine's, `s x 3` [m] each."""
+    place, nominal = (prepared.mechanism.frame(pose[repeat])[0] for pose in (prepared.pose, _nominal(prepared)))
+    return place, place - nominal
+
+
+def _nominal(prepared: Prepared) -> Tensor:
+    """Poses of the nominal machine, fitted frames included, `r x s x p`."""
+    return prepared.mechanism.forward_kinematics(prepared.joints, prepared.parameters, _given(prepared))
 
 
 def pose_with_geometry(prepared: Prepared) -> PoseError | None:
@@ -129,8 +141,9 @@ def _of_records(
         wanted = _vectors(prepared, nominal)
         reached.append(_apart(prepared, _model(prepared, k, *moved), wanted) + rest)
         damped += float((solved[0].status == 3).double().mean()) / len(prepared.joints)
-    explained, after = (_error(prepared, torch.stack(each)) for each in (left, reached))
-    return Outcome(fitted, deviation, score, explained, after, None, tuple(found), without, damped)
+    whole = torch.stack(reached)
+    explained, after = (_error(prepared, each) for each in (torch.stack(left), whole))
+    return Outcome(fitted, deviation, score, explained, after, None, tuple(found), without, damped, whole)
 
 
 def pose_with_effects(prepared: Prepared) -> PoseError | None:

@@ -29,6 +29,7 @@ from ccnn_torch.report.figures import (
     styled,
     workspace_plot,
 )
+from ccnn_torch.report.machine import machine_plot
 from ccnn_torch.report.results.run import RunResults
 
 Array = NDArray[np.float64]
@@ -201,7 +202,7 @@ def write_report(folder: str | Path, results: RunResults | None = None) -> Path:
     results = RunResults.read(folder / "results.json") if results is None else results
     write_tables(folder, results)
     figures = inline_figures(run_plots(folder, results), folder / "plots")
-    return run_page(results, figures).write_html(folder / "report.html", _LINKED)
+    return run_page(results, figures, folder).write_html(folder / "report.html", _LINKED)
 
 
 def run_plots(folder: str | Path, results: RunResults) -> list[Plot]:
@@ -210,7 +211,13 @@ def run_plots(folder: str | Path, results: RunResults) -> list[Plot]:
     plots: list[Plot | None] = []
     if (folder / ARRAYS_FILE).is_file():
         arrays = load_arrays(folder)
-        plots += [pose_error_plot(arrays), workspace_plot(arrays), joint_error_plot(arrays)]
+        words = "With " + " + ".join([*results.pose.parts, arrays.labels.get("method", "the model")])
+        plots += [
+            machine_plot(arrays.drawn, words),
+            pose_error_plot(arrays),
+            workspace_plot(arrays),
+            joint_error_plot(arrays),
+        ]
         if arrays.masks:
             names = [joint.name for joint in arrays.joints]
             method = arrays.labels.get("method", "model")

@@ -18,6 +18,7 @@ from torch import Tensor
 from ccnn_torch.calibration.calibrate import Calibration, calibrate, makers
 from ccnn_torch.calibration.callbacks import HeldOut, ProgressBar, TensorBoardCallback, genome
 from ccnn_torch.calibration.config import RunConfig, method_names
+from ccnn_torch.calibration.evaluate import place_and_error
 from ccnn_torch.calibration.fitting import check_storable
 from ccnn_torch.calibration.page import errors_line, run_page, write_tables
 from ccnn_torch.calibration.prepare import Prepared, TooManyRepeatsError, prepare
@@ -28,6 +29,7 @@ from ccnn_torch.display import typed_path
 from ccnn_torch.engine import Failure, Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError, WriteError
 from ccnn_torch.mechanisms import Instrument
+from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.plugins import is_plugin
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import plain, read_json, write_json
@@ -90,7 +92,7 @@ def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, details: bool
             )
         write_blocks(config, folder, list(blocks.values()), lambda path: RUN.resume(path, quiet=True, details=None))
     if details is not None and not quiet:
-        run_page(RunResults.read(folder.results)).show(stdout, details)
+        run_page(RunResults.read(folder.results), folder=folder.path).show(stdout, details)
         say_place(f"Everything is in {typed_path(str(folder.path))}")
 
 
@@ -128,7 +130,7 @@ def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet:
             run_page(calibration.results).show(stdout)
             raise
     if details is not None and not quiet:
-        run_page(calibration.results).show(stdout, details)
+        run_page(calibration.results, folder=folder.path).show(stdout, details)
         place = typed_path(str(folder.path))
         say_place(f"Everything is in {place}; open {place}/report.html")
 
@@ -325,8 +327,26 @@ def _arrays(calibration: Calibration) -> RunArrays:
         masks=tuple(mask.cpu().numpy() for mask in masks),
         weights=tuple(_numpy(weight) for weight in weights),
         axes=axes,
+        drawn={} if turns else {name: _numpy(value) for name, value in _drawn(calibration, test).items()},
         labels={"method": method, "repeat": str(k), "mechanism": mechanism.name},
     )
+
+
+def _drawn(calibration: Calibration, test: Tensor) -> dict[str, Tensor]:
+    """The machine with the errors of the rows `s` bool: vectors where positions were measured, else sizes."""
+    prepared, k = calibration.prepared, calibration.repeat()
+    mechanism, outcome = prepared.mechanism, calibration.outcomes[calibration.method]
+    before, after = calibration.before.position[k], outcome.after.position[k]
+    joints, pose = prepared.joints[k], prepared.pose[k] if prepared.simulation is None else prepared.simulation.pose[k]
+    parameters = None if prepared.parameters is None else prepared.parameters[k].expand(len(joints), -1)[test]
+    if isinstance(mechanism, Instrument):
+        place = mechanism.hand(joints)
+    elif outcome.left is None:
+        place = mechanism.frame(pose)[0]
+    else:
+        (place, before), after = place_and_error(prepared, k), outcome.left[k, :, :3]
+    joints, pose, place, before, after = (each[test].detach() for each in (joints, pose, place, before, after))
+    return drawn(mechanism, joints, pose, place, before, after, parameters)
 
 
 def _history(training: Training) -> dict[str, NDArray[np.float64]]:

@@ -7,12 +7,14 @@ the paper's cases its printed figures are listed beside ours. All numbers are me
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.display import count_text, display_unit, number_text, typed_path
 from ccnn_torch.files.write import write_rows, write_whole
 from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.report.page import Answer, InlineFigure, Page, sections_of
@@ -24,13 +26,14 @@ from ccnn_torch.report.table import Table, table_of
 _WORSE = 1.01
 
 
+@cache
 def paper_case(case: str | None) -> dict[str, Any] | None:
     """What the paper prints of a case, as `paper.yaml` has it; None where `results.case` is none of its cases."""
     return None if case is None else read_yaml(Path(__file__).with_name("paper.yaml")).get(case.partition(":")[0])
 
 
-def run_page(results: RunResults, figures: Sequence[InlineFigure] = ()) -> Page:
-    """All that a run shows."""
+def run_page(results: RunResults, figures: Sequence[InlineFigure] = (), folder: Path | None = None) -> Page:
+    """All that a run shows; with its folder also the next commands."""
     rows = results.rows
     facts = f"{rows.train} training, {rows.validation} validation and {rows.test} held-out rows"
     facts += f", {rows.not_trained_on} not trained on" if rows.not_trained_on else ""
@@ -40,7 +43,7 @@ def run_page(results: RunResults, figures: Sequence[InlineFigure] = ()) -> Page:
         name=results.name,
         kind="calibration report",
         verdict=verdict(results),
-        sections=sections_of(result_tables(results), figures, _answers(results)),
+        sections=sections_of(result_tables(results), figures, _answers(results, folder)),
         facts=facts + f" · case {results.case} of the paper" if results.case else facts,
         cautions=[*([worse] if worse else []), *failures(results)],
         notes=results.notes,
@@ -50,18 +53,25 @@ def run_page(results: RunResults, figures: Sequence[InlineFigure] = ()) -> Page:
     )
 
 
-def _answers(results: RunResults) -> list[Answer]:
-    """What each part of the model leaves of the RMS position error, where it has parts."""
-    position, best = results.pose.position, results.best_method
-    if best is None or not results.pose.parts:
-        return []
-    steps = [("as it is", position.before), *((part, position[part]) for part in results.pose.parts)]
-    told = []
-    for name, block in [*steps, (best, position.after)]:
-        scale, unit = display_unit("m", block.rms.median or 0.0)
-        size = number_text(None if block.rms.median is None else block.rms.median / scale, 3)
-        told.append(f"{size} {unit} {name}" if name == "as it is" else f"with {name} {size} {unit}")
-    return [Answer("Step by step", f"{', '.join(told)} (RMS position error on held-out rows).")]
+def _answers(results: RunResults, folder: Path | None) -> list[Answer]:
+    """What each part of the model leaves of the RMS position error, where it has parts, and what to do next."""
+    position, best, told = results.pose.position, results.best_method, list[Answer]()
+    if best is not None and results.pose.parts:
+        steps = [("as it is", position.before), *((part, position[part]) for part in results.pose.parts)]
+        parts = []
+        for name, block in [*steps, (best, position.after)]:
+            scale, unit = display_unit("m", block.rms.median or 0.0)
+            size = number_text(None if block.rms.median is None else block.rms.median / scale, 3)
+            parts.append(f"{size} {unit} {name}" if name == "as it is" else f"with {name} {size} {unit}")
+        told.append(Answer("Step by step", f"{', '.join(parts)} (RMS position error on held-out rows)."))
+    if folder is not None and results.records is not None:
+        path = typed_path(str(folder))
+        if results.model is not None and results.model.method is not None:
+            line = f"ccnn compensate {shlex.quote(f'{path}/model.safetensors')} TARGETS.csv COMMANDS.csv --pose"
+            told.append(Answer("Next", "correct targets by this model.", (line,)))
+        line = f"ccnn identify {shlex.quote(f'{path}/config.yaml')} out={shlex.quote(f'{path}_numbers')}"
+        told.append(Answer("To enter", "the model holds its numbers; those to type into a controller:", (line,)))
+    return told
 
 
 def verdict(results: RunResults) -> str:
@@ -140,8 +150,8 @@ def worse_text(results: RunResults) -> str:
     text = f"On held-out rows {best} makes it worse than {instead} ({left} → {right} {unit} RMS position error)"
     if parts and position.explained is not None and (position.explained.rms.median or after) <= _WORSE * alone:
         return (
-            f"{text}: the model is right, but its file holds commands back near singular poses; ccnn identify, then "
-            "ccnn compensate identified.yaml, commands by the geometry."
+            f"{text}: the model is right, but its file holds commands back near singular poses or at limits; "
+            "ccnn identify, then ccnn compensate identified.yaml, commands by the geometry."
         )
     if best == "constant":
         return f"{text}: what it learned of the training rows does not hold on others."

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import torch
-from scipy.special import ndtri, stdtrit
 from torch import Tensor
 
 from ccnn_torch.calibration.dataset import Dataset
 from ccnn_torch.compensation import Domain
 
-# scipy.special's quantiles are those of scipy.stats, which takes half a second to load.
-NORMAL = float(ndtri(0.975))
+NORMAL = 1.959963984540054
 """An interval of 95 % reaches so many predictive standard deviations to either side."""
 _TRUSTED = 100.0
 """Held-out figures (rows times joints) from which the shape of their tails counts more than a normal one."""
@@ -42,6 +40,9 @@ def sd_scale(residuals: Tensor, sd: Tensor, weights: Tensor) -> Tensor:
     """
     if residuals.shape[1] == 0:
         return residuals.new_ones(len(residuals), residuals.shape[-1])
+    # Only a training with rows held out waits for it; scipy.stats would take half a second.
+    from scipy.special import stdtrit
+
     there = (weights > 0).unsqueeze(-1)
     square = torch.where(there, residuals / sd, 0.0).square()
     rows = there.sum(1)

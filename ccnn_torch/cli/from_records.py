@@ -259,7 +259,8 @@ def diagnose(
 
     ccnn diagnose --since runs/ur10/model.safetensors new.csv --out runs/ur10_now
     """
-    if overrides and records is None and Path(overrides[0]).suffix.lower() in _TABLES:
+    first = Path(overrides[0]) if overrides else None
+    if overrides and first and records is None and (first.suffix.lower() in _TABLES or first.is_dir()):
         records, overrides = overrides[0], overrides[1:]
     with loading():
         from ccnn_torch.diagnosis.job import run_diagnosis
@@ -295,8 +296,8 @@ def _diagnose_since(model: Path, wanted: DiagnoseConfig, details: bool, quiet: b
     with if_stopped(NOTHING_WRITTEN):
         folder, loaded = folder_of(wanted, "since.json"), load_compensation(model)
         keys = {name: getattr(wanted, name) for name in ("columns", "joint_map", "mechanism_keys", "seed")}
-        results = what_changed(loaded, wanted.records, wanted.mechanism, **keys)
-        write_since(folder, results, loaded.joints)
+        results, picture = what_changed(loaded, wanted.records, wanted.mechanism, **keys)
+        write_since(folder, results, loaded.joints, picture)
     if quiet:
         return
     say(results.text)

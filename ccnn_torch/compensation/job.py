@@ -380,7 +380,7 @@ def sentences(output: Path, found: Compensated, model: LoadedModel) -> list[str]
     if found.damped:
         said.append(
             f"{found.damped} of them {_is(found.damped)} near a singular pose or at a limit of the joints "
-            f"(status = {DAMPED}), with the nearest safe command."
+            f"(key limits of the machine's file; status = {DAMPED}), with the nearest safe command."
         )
     return [*said, found.branch] if found.branch else said
 

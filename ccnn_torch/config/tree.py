@@ -251,6 +251,10 @@ class JobConfig(Section):
         return dump_yaml(tree)
 
 
+# Keys of another command that a remark names; a resolved config has all of them.
+_LISTED = 8
+
+
 def _used(tree: dict[str, Any], model: type[BaseModel], path: Path, note: Note | None) -> dict[str, Any]:
     """A file's keys without those that `ccnn run` alone has; of a config for `ccnn run` the shared ones."""
     run, shared = config_model("run"), getattr(model, "of_a_run", ())
@@ -265,10 +269,12 @@ def _used(tree: dict[str, Any], model: type[BaseModel], path: Path, note: Note |
         for key, value in tree.items()
         if key not in names
     }
-    if note is not None:
-        left = [name for name in sorted(names) if name.partition(".")[0] == name or name.partition(".")[0] in kept]
+    # A split is of every run, and what does not use it holds rows out by itself.
+    left = [n for n in sorted(names) if (first := n.partition(".")[0]) in {n, *kept} and first != "split"]
+    if note is not None and left:
         are = "is a key of ccnn run and is" if len(left) == 1 else "are keys of ccnn run and are"
-        note(f"{path}: {', '.join(left)} {are} not used here.")
+        more = f" and {len(left) - _LISTED} more" if len(left) > _LISTED else ""
+        note(f"{path}: {', '.join(left[:_LISTED])}{more} {are} not used here.")
     return kept
 
 

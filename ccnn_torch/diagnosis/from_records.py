@@ -33,6 +33,7 @@ from ccnn_torch.effects.apply import ByGroup
 from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.effects.found_machine import found_block
+from ccnn_torch.effects.situation import has_upright_base
 from ccnn_torch.effects.time import ROW, FrameDrift, Homing, elapsed
 from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import (
@@ -412,7 +413,7 @@ def in_own_base(situation: Situation, values: Tensor) -> tuple[Situation, Tensor
     nominal = torch.cat([parameters[0, base:-6], values[-6:]]) if machine.tool_per else parameters[0, base:]
     alone = one.with_nominal(torch.cat([none, nominal]))
     down = situation.gravity
-    if base:
+    if base and not has_upright_base(machine):
         down = rotation_vector_to_matrix(parameters[0, 3:6]).mT @ down
     return replace(situation, mechanism=alone, parameters=None, gravity=down), torch.cat([none, values[base:]])
 

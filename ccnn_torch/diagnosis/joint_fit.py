@@ -26,10 +26,15 @@ from ccnn_torch.effects import Acting, Effect, Situation, measured_channels, mov
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.evidence.priors import EFFECT
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.outliers import inlying
 
-# Gauss-Newton steps, at most.
-_ROUNDS = 4
+# Estimates of prior scales, noise and weights of the rows, at most, and what they change in what is left from which
+# there is no other, as a share of it.
+_ROUNDS, _SETTLED = 4, 1e-2
+# Steps of Levenberg and Marquardt at each, at most, the first damping, and the share of the coefficients that a last
+# step may change.
+_STEPS, _DAMPING, _LAST = 12, 1e-8, 0.1
 # Times an effect that may have any period acts, at most: a gear train errs with more than one.
 _TIMES = 2
 _PARAMETERS = "parameters"
@@ -62,23 +67,50 @@ def fit_jointly(
         by group.
     """
     model = _Model(situation, known, loose)
-    at, white = model.nominal.new_zeros(model.size), None
-    before: tuple[Tensor, Tensor] | None = None
-    for turn in range(_ROUNDS + 1):
-        rows = model.about(at, measured, usable)
-        white = rows.whitening() if white is None else white
+    at = model.nominal.new_zeros(model.size)
+    rows = model.about(at, measured, usable)
+    white = rows.whitening()
+    for _ in range(_ROUNDS):
         white = replace(white, weight=torch.where(rows.fine[:, None], white.weight, 0.0))
-        if before is not None and white(rows.left).square().sum() > white(before[0]).square().sum():
-            # A step that leads away from the rows.
-            at = before[1]
-            break
-        if turn == _ROUNDS:
-            break
-        before = rows.left, at
         fit = fit_sets(rows.grams(white), [rows.groups], 0.0)
-        at = fit.mean.new_zeros(model.size).index_copy(0, torch.cat([torch.arange(0), *rows.groups]), fit.mean[0])
+        before, (at, rows) = rows, _most_probable(rows, at, white, fit, measured)
+        change, left = (white(v).norm() for v in (rows.left - before.left, rows.left))
         white = rows.renewed(white, fit, at)
+        if float(change) <= _SETTLED * float(left):
+            break
     return JointFit(model.acting(at), model.parameters(at))
+
+
+def _most_probable(rows: _Rows, at: Tensor, white: Whitening, fit: Fits, measured: Tensor) -> tuple[Tensor, _Rows]:
+    """The most probable coefficients at the prior scales and the noise of a fit, and the rows about them.
+
+    A step that leads away from the rows, or to where one of them cannot be, is shortened (Levenberg-Marquardt): what
+    the rows hardly show may turn so far that the linear model is no model of it.
+    """
+    model, groups, begin = rows.model, rows.groups, at
+    free = torch.cat([torch.arange(0), *groups])
+    scales_of = [s.expand(len(g)) for g, s in zip(groups, fit.log_scale[0], strict=True)]
+    # What the prior asks of a coefficient, in units of the noise.
+    drawn = (fit.noise[0] / torch.cat([at[:0], *scales_of]).exp()).sqrt()
+    seen = [(at[free], rows)]
+
+    def both(values: Tensor) -> tuple[Tensor, Tensor]:
+        if not torch.equal(values[0], seen[-1][0]):
+            seen.append((values[0], model.about(begin.index_copy(0, free, values[0]), measured, rows.fine)))
+        here = seen[-1][1]
+        left = torch.cat([white(here.left).flatten(), drawn * values[0]])
+        slope = torch.cat([-white(here.columns[..., free]).flatten(0, 1), drawn.diag()])
+        return left.where((here.fine == rows.fine).all(), torch.inf)[None], slope[None]
+
+    found = levenberg_marquardt(
+        lambda values: both(values)[0],
+        at[free][None],
+        both=both,
+        max_iterations=_STEPS,
+        tolerance=_LAST,
+        damping=_DAMPING,
+    ).value[0]
+    return begin.index_copy(0, free, found), next(r for values, r in seen if torch.equal(values, found))
 
 
 def effects_that_pay(

@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm
+from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm, sees_directions
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
@@ -27,10 +27,15 @@ _LEAST = 0.1
 
 
 def default_gravity(mechanism: Mechanism) -> Tensor:
-    """Along -y for a machine that moves in the x-y plane alone, else along -z; `3` [m/s²], base frame."""
+    """Along -y for a machine that moves in the x-y plane alone, else along -z; `3` [m/s²], as `Situation` has it."""
     names = {c.name for c in mechanism.pose}
     flat = "z" not in names and {"x", "y"} <= names
     return torch.tensor([0.0, -_STANDARD if flat else 0.0, 0.0 if flat else -_STANDARD], dtype=torch.float64)
+
+
+def has_upright_base(mechanism: Mechanism) -> bool:
+    """Whether gravity is along one direction of the machine's own base, however the frames of the poses stand."""
+    return isinstance(mechanism, SerialArm) and bool(mechanism.frame_per) and not sees_directions(mechanism)
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,8 @@ class Situation:
         covariates: by name, `... x s` each [SI]: `time`, `temperature`, `load_NAME` (force along the pose coordinate
             NAME on the platform [N], or moment [N·m]), `direction1`…`directionN` (sign of the joint's last motion),
             `speed…`.
-        gravity: `3` [m/s²], base frame.
+        gravity: `3` [m/s²], in the frame of the poses; of an arm with a base frame for each group of rows, in the arm's
+            own base: a plate of sockets may stand in any direction.
         parameters: of the nominal machine, broadcast against the rows; None = its nominal ones.
         guess: poses near by, for mechanisms whose forward kinematics has no closed form, `... x s x p`; or None.
     """
@@ -293,9 +299,14 @@ class Situation:
 
     @cached_property
     def down(self) -> Tensor:
-        """Unit vector along gravity, `3`; 0 where there is none."""
+        """Unit vector along gravity in the frame of the poses, `3`, or `s x 3` where the frame is by row; 0 where there
+        is none."""
         size: Tensor = torch.linalg.vector_norm(self.gravity)
-        return self.gravity / size.clamp_min(1e-300)
+        down = self.gravity / size.clamp_min(1e-300)
+        if not has_upright_base(self.mechanism):
+            return down
+        turn = rotation_vector_to_matrix(self.mechanism.resolve(self.parameters)[..., 3:6])
+        return (turn @ down[:, None]).squeeze(-1)
 
     def push(self, weight: Tensor, rows: Tensor | None = None) -> Tensor:
         """How hard weight and load push each joint along its coordinate, `... x s x n` [1].

@@ -306,6 +306,9 @@ def _blank_harmonics(shape: Sequence[int] | None, outputs: int) -> Harmonics | N
 class _Sparse(nn.Linear):
     """A layer whose connections of weight 0 are none, and stay so when the network is trained on."""
 
+    def reset_parameters(self) -> None:
+        """Draw no start values: they would come from the global random state."""
+
     def forward(self, inputs: Tensor) -> Tensor:
         """`... x i` -> `... x o`."""
         weight = self.weight
@@ -315,10 +318,7 @@ class _Sparse(nn.Linear):
 
 
 def _linear(weight: Tensor, width: int) -> nn.Linear:
-    # Without its usual start values: those would be drawn from the global random state.
-    with torch.device("meta"):
-        linear = _Sparse(width, len(weight), dtype=torch.float64)
-    linear.to_empty(device=weight.device)
+    linear = _Sparse(width, len(weight), dtype=torch.float64, device=weight.device)
     linear.requires_grad_(False)
     linear.weight.copy_(weight[:, :width])
     linear.bias.copy_(weight[:, width] if weight.shape[-1] > width else torch.zeros_like(weight[:, 0]))

@@ -38,6 +38,7 @@ from ccnn_torch.identification.constrained_rows import (
     read_constraint,
     rows_of,
 )
+from ccnn_torch.identification.judge import drawn_sizes
 from ccnn_torch.identification.measured import Kinematics, Measured, Rows, nominal_machine
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.poses import forward_problem
@@ -49,6 +50,7 @@ from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.mechanisms.frames.instrument import instrument
 from ccnn_torch.records.commanded import read_joints
 from ccnn_torch.records.load import read_source
+from ccnn_torch.verification.promise import configurations, promise_block
 
 # Links and noise are estimated in turn, the noise from this size on [m].
 _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
@@ -403,6 +405,7 @@ def identify_by_constraint(
     fit = fit_constraint(config, mechanism, rows, progress, others)
     held = rows.weights == 0
     before, after = (_held_error(mechanism, rows, s, held) for s in (fit.before, fit.after))
+    picture = drawn_sizes(mechanism, rows.joints[held], before.position[0], after.position[0], fit.after.geometry)
     if config.fits_again() and bool(held.any()):
         every = replace(rows, weights=torch.ones_like(rows.weights))
         again = fit_constraint(config, mechanism, every, None, others)
@@ -430,7 +433,11 @@ def identify_by_constraint(
     found = Found(outcome, _known(fit), before, after)
     results, arrays = assemble(config, measured, fit.selection, {"lm": found}, noise, _only_by_prior(fit, found.known))
     results["constraint"] = _constraint(config, rows, fit)
-    return measured, {"lm": outcome}, results, arrays
+    if rows.in_sockets and bool(held.any()):
+        # Other constraints show less than a place, to which new positions could not be held.
+        first, last = (PoseError(error.position[0], None) for error in (before, after))
+        results["promise"] = promise_block(first, last, configurations(rows.joints[held], mechanism.joints))
+    return measured, {"lm": outcome}, results, arrays | picture
 
 
 def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ccnn_torch.display import display_unit
 from ccnn_torch.identification.page import holder
 from ccnn_torch.report.figures import AFTER, BEFORE, Plot, distribution_plot, styled
+from ccnn_torch.report.machine import machine_plot
 
 Array = NDArray[np.float64]
 Arrays = Mapping[str, Array]
@@ -23,6 +24,7 @@ _DRAWN = 4000
 def identified_plots(results: Results, arrays: Arrays) -> list[Plot]:
     """All pictures; one whose data is not there is left out."""
     plots: list[Plot | None] = [
+        machine_plot(arrays, "As identified"),
         pose_distribution_plot(results, arrays),
         parameter_plot(results, arrays),
     ]

@@ -18,7 +18,7 @@ from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig, base_method
 from ccnn_torch.identification.constrained import identify_by_constraint
-from ccnn_torch.identification.judge import read_elsewhere, transferred
+from ccnn_torch.identification.judge import drawn_errors, read_elsewhere, transferred
 from ccnn_torch.identification.measured import Measured, from_records, nominal_machine
 from ccnn_torch.identification.page import identified_page, not_settled, write_identified_csv, write_identified_report
 from ccnn_torch.identification.result import Found, assemble, beside_truth, judged, known_at, promised
@@ -174,10 +174,12 @@ def _judged(
 ) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Outcome]]:
     """The content of `identified.json`, tensors by name for the pictures, and the outcome of every method."""
     selection, first = select(measured, config), config.methods[0]
+    picture = drawn_errors(measured, outcomes[first].values)
     found = {name: judged(config, measured, selection, name, outcome) for name, outcome in outcomes.items()}
     found = {name: _refitted(config, measured, name, one) for name, one in found.items()}
     outcomes = {name: one.outcome for name, one in found.items()}
     results, arrays = assemble(config, measured, selection, found, _given_noise(config, measured))
+    arrays |= picture
     results["promise"] = promised(measured, found[first])
     if measured.truth is None:
         return results, arrays, outcomes

@@ -16,7 +16,8 @@ from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.measured import Measured, Rows, read_records, rows_of_split, split_records
-from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, fit_frames
+from ccnn_torch.mechanisms import Instrument, Mechanism, PoseError, Seen, SerialArm, SetUps, fit_frames
+from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.least_squares import jacobian_of
 
@@ -90,6 +91,36 @@ def before_and_after(
 def _rms(values: Tensor) -> Tensor:
     """`r x t` -> `r`."""
     return values.square().nanmean(-1).sqrt()
+
+
+def drawn_errors(measured: Measured, values: Tensor) -> dict[str, Tensor]:
+    """The picture of the first machine: errors of the held-out poses by the geometry at the start, and by `r x K`.
+
+    {} of readings that have no place, and of set-ups with frames of their own.
+    """
+    mechanism, rows = measured.mechanism, measured.test
+    if isinstance(mechanism, Instrument | SetUps) or not rows.joints.shape[1]:
+        return {}
+    joints, observed = rows.joints[0], rows.observed[0]
+
+    def frame(parameters: Tensor) -> Tensor:
+        guess = completed(mechanism, joints, observed, parameters)
+        return measured.kinematics.frame(joints, parameters, guess)[0].detach()
+
+    place = mechanism.frame(observed)[0]
+    before, after = (place - frame(one[0]) for one in (measured.start, values))
+    return drawn(mechanism, joints, observed, place, before, after, values[0])
+
+
+def drawn_sizes(
+    mechanism: Mechanism, joints: Tensor, before: Tensor, after: Tensor, geometry: Tensor
+) -> dict[str, Tensor]:
+    """The machine at the held-out rows `t x n` with the sizes of their errors `t` [m]; a constraint has no pose."""
+    arm, values = mechanism, geometry
+    if isinstance(mechanism, Seen):
+        arm, values = mechanism.mechanism, geometry[: len(mechanism.mechanism.geometry)]
+    pose = arm.forward_kinematics(joints, values)
+    return drawn(arm, joints, pose, arm.frame(pose)[0], before, after, values)
 
 
 class Commanded(NamedTuple):

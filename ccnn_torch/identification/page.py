@@ -8,10 +8,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ccnn_torch.compensation.targets.machines import STEPPERS, klipper_numbers
-from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter
+from ccnn_torch.compensation.targets.machines import klipper_numbers
+from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter, typed_path
 from ccnn_torch.files.write import write_rows
 from ccnn_torch.identification.judge import figure_text
+from ccnn_torch.records.formats.klipper import STEPPERS
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.page import Answer, InlineFigure, Page, Section, sections_of
@@ -203,7 +204,7 @@ def _clearest(results: Block) -> Iterator[str]:
 
 
 def identified_page(results: Block, figures: Sequence[InlineFigure] = (), folder: str | None = None) -> Page:
-    """All that an identification shows; with its folder, on a screen, also the next command."""
+    """All that an identification shows; with its folder also the next command."""
     rows, machines = results["rows"], results["machines"]
     legs = "".join(f", {count} for leg {leg}" for leg, count in sorted(rows["per_leg"].items()))
     how = f"{count_text(machines, 'machine')} {'simulated' if results['simulated'] else 'measured'}"
@@ -478,4 +479,4 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
     results = read_json(folder / "identified.json") if results is None else results
     arrays = load_tensors(folder / ARRAYS_FILE)[0]
     figures = inline_figures(identified_plots(results, arrays), folder / "plots")
-    return identified_page(results, figures).write_html(folder / "report.html", _LINKED)
+    return identified_page(results, figures, typed_path(str(folder))).write_html(folder / "report.html", _LINKED)

@@ -33,10 +33,13 @@ def covariance(kernel: str, rows: Tensor, length_scale: Tensor, output_scale: Te
         length_scale: one an input, `... x i`.
         output_scale: variance of the function, `...`.
     """
-    scaled = rows / length_scale.unsqueeze(-2)
-    own = (scaled * scaled).sum(-1)
-    squared = own.unsqueeze(-1) + own.unsqueeze(-2) - 2 * (scaled @ scaled.mT)
-    return output_scale[..., None, None] * _correlation(kernel, squared)
+    return output_scale[..., None, None] * _correlation(kernel, _squared_distances(rows / length_scale.unsqueeze(-2)))
+
+
+def _squared_distances(rows: Tensor) -> Tensor:
+    """rows: `... x n x i`; returns `... x n x n`."""
+    own = (rows * rows).sum(-1)
+    return own.unsqueeze(-1) + own.unsqueeze(-2) - 2 * (rows @ rows.mT)
 
 
 def _correlation(kernel: str, squared: Tensor) -> Tensor:
@@ -47,6 +50,19 @@ def _correlation(kernel: str, squared: Tensor) -> Tensor:
     scaled = torch.sqrt((3.0 if kernel == "matern32" else 5.0) * squared)
     polynomial = 1 + scaled if kernel == "matern32" else 1 + scaled + scaled * scaled / 3
     return polynomial * torch.exp(-scaled)
+
+
+def _correlation_and_slope(kernel: str, squared: Tensor) -> tuple[Tensor, Tensor]:
+    """`_correlation`, and its derivative by the squared distance."""
+    squared = squared.clamp_min(_NO_DISTANCE)
+    if kernel == "rbf":
+        correlation = torch.exp(-0.5 * squared)
+        return correlation, -0.5 * correlation
+    scaled = torch.sqrt((3.0 if kernel == "matern32" else 5.0) * squared)
+    decay = torch.exp(-scaled)
+    if kernel == "matern32":
+        return (1 + scaled) * decay, -1.5 * decay
+    return (1 + scaled + scaled * scaled / 3) * decay, -5 / 6 * (1 + scaled) * decay
 
 
 def spread_factor(covariances: Tensor) -> Tensor:
@@ -86,8 +102,8 @@ def log_evidence(
 ) -> Evidence:
     """Log marginal likelihood (Rasmussen and Williams 2006, eq. 5.8) and its slope (eq. 5.9) by one Cholesky factor.
 
-    The factor is not differentiated: with A = dual · dualᵀ - covariance⁻¹, the slope by the covariance is A / 2, and
-    autograd carries it on to the hyperparameters.
+    With A = dual · dualᵀ - covariance⁻¹ the slope by the covariance is A / 2, and that by a length scale is a product
+    of this matrix with the rows.
 
     Args:
         kernel: one of `KERNELS`.
@@ -98,32 +114,43 @@ def log_evidence(
         weights: `b x n`: the noise of a row has the variance noise / weight; rows of weight 0 do not exist.
     """
     there = weights > 0
-    theta = theta.detach().requires_grad_()
     length_scale, (output_scale, noise, mean) = theta[..., :-3].exp(), theta[..., -3:].unbind(-1)
-    noise, mean = (noise.exp() + noise_floor).unsqueeze(-1), mean.unsqueeze(-1)
-    noises = torch.where(there, noise / torch.where(there, weights, 1.0), 1.0)
-    both = there.unsqueeze(-1) & there.unsqueeze(-2)
-    covariances = covariance(kernel, inputs, length_scale, output_scale.exp())
-    covariances = torch.where(both, covariances, 0.0) + torch.diag_embed(noises)
-    with torch.no_grad():
-        factor, info = torch.linalg.cholesky_ex(covariances)
-        identity = torch.eye(inputs.shape[1], dtype=inputs.dtype, device=inputs.device)
-        factor = torch.where((info == 0)[:, None, None], factor, identity)
-        error = torch.where(there, targets - mean, 0.0)
-        dual = torch.cholesky_solve(error.unsqueeze(-1), factor).squeeze(-1)
-        half_logdet = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        fit = -0.5 * (error * dual).sum(-1) - half_logdet - 0.5 * math.log(2 * math.pi) * there.to(mean.dtype).sum(-1)
-        slope = 0.5 * (dual.unsqueeze(-1) * dual.unsqueeze(-2) - torch.cholesky_inverse(factor))
-    prior = _log_prior(theta, noise.log().squeeze(-1))
-    carried = (slope * covariances).sum() + (dual * mean).sum() + prior.sum()
-    (gradient,) = torch.autograd.grad(carried, theta)
+    signal, free = torch.where(there, output_scale.exp().unsqueeze(-1), 0.0), noise.exp()
+    noise = free + noise_floor
+    noises = torch.where(there, noise.unsqueeze(-1) / torch.where(there, weights, 1.0), 1.0)
+    scaled = torch.where(there.unsqueeze(-1), inputs, 0.0) / length_scale.unsqueeze(-2)
+    correlation, decline = _correlation_and_slope(kernel, _squared_distances(scaled))
+    both = signal.unsqueeze(-1) * there.unsqueeze(-2)
+    function = correlation.mul_(both)
+    covariances = function.clone()
+    covariances.diagonal(dim1=-2, dim2=-1).add_(noises)
+    factor, info = torch.linalg.cholesky_ex(covariances)
+    identity = torch.eye(inputs.shape[1], dtype=inputs.dtype, device=inputs.device)
+    factor = torch.where((info == 0)[:, None, None], factor, identity)
+    error = torch.where(there, targets - mean.unsqueeze(-1), 0.0)
+    dual = torch.cholesky_solve(error.unsqueeze(-1), factor).squeeze(-1)
+    half_logdet = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    fit = -0.5 * (error * dual).sum(-1) - half_logdet - 0.5 * math.log(2 * math.pi) * there.to(mean.dtype).sum(-1)
+    by_covariance = torch.baddbmm(torch.cholesky_inverse(factor), dual.unsqueeze(-1), dual.unsqueeze(-2), beta=-1.0)
+    by_covariance.mul_(0.5)
+    by_distance = decline.mul_(both).mul_(by_covariance)
+    # Sums of by_distance · (x - x')² over all pairs, input by input.
+    apart = scaled * scaled * by_distance.sum(-1, keepdim=True) - scaled * (by_distance @ scaled)
+    by_noise = (by_covariance.diagonal(dim1=-2, dim2=-1) * noises * there).sum(-1) * free / noise
+    slope = [(by_covariance * function).sum((-2, -1)), by_noise, dual.sum(-1)]
+    gradient = torch.cat([-4 * apart.sum(-2), torch.stack(slope, -1)], -1)
+    # Of as many numbers as there are hyperparameters: autograd costs nothing here.
+    with torch.enable_grad():
+        asked = theta.detach().requires_grad_()
+        prior = _log_prior(asked, (asked[..., -2].exp() + noise_floor).log())
+        gradient = gradient + torch.autograd.grad(prior.sum(), asked)[0]
     value = fit + prior.detach()
     good = (info == 0) & value.isfinite() & gradient.isfinite().all(-1)
     return Evidence(
         torch.where(good, value, -torch.inf),
         torch.where(good.unsqueeze(-1), gradient, 0.0),
         torch.where(good.unsqueeze(-1), dual, 0.0),
-        torch.where(good.unsqueeze(-1), dual * noises.detach() * there, error),
+        torch.where(good.unsqueeze(-1), dual * noises * there, error),
     )
 
 

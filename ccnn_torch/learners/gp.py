@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.settings import check_least
-from ccnn_torch.learners.gaussian_process import GPNetwork, covariance, log_evidence, spread_factor
+from ccnn_torch.learners.gaussian_process import Evidence, GPNetwork, covariance, log_evidence, spread_factor
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import taken, usable_rows
 from ccnn_torch.numerics.blocks import block_size
@@ -26,11 +26,12 @@ _CHUNK = 1 << 18
 # Matrices of one size that a marginal likelihood and its slope hold at a time.
 _COPIES = 12
 # Steps between two checks of whether the likelihood still rises.
-_LOOK = 10
-# Rprop's step sizes never leave these bounds [nats of a hyperparameter's logarithm].
+_LOOK = 5
+# The largest and the smallest first step [nats of a hyperparameter's logarithm]; no later one is larger.
 _STEP_SIZES = (1e-4, 1.0)
-# What Rprop multiplies a step size by where the slope has changed its sign, and where it has kept it.
-_SHORTER, _LONGER = 0.5, 1.2
+# Share of the rise that the slope promises which a step must bring (Armijo's condition; Nocedal and Wright, "Numerical
+# Optimization", 2006, eq. 3.4), and what shortens the next trial where it does not.
+_PROMISED, _SHORTER = 1e-4, 0.3
 # Logarithms that a search starts from: length scales of the inputs' whole range, a twentieth of the variance noise.
 # From a third it ended where some joints of a UR10 are taken for noise (validation error 0.09 instead of 0.06); where
 # little can be learned the start makes no difference.
@@ -46,8 +47,8 @@ class GPSettings:
         kernel: matern32, matern52 or rbf, each with one length scale an input. On a UR10 the first has the highest
             marginal likelihood, validation errors are 0.068, 0.068 and 0.143; on the tripod they are alike.
         steps: steps of the search for the hyperparameters, at most; each costs one marginal likelihood and its slope.
-        learning_rate: first step in the logarithms of the hyperparameters; Rprop finds its own from there.
-        tolerance: an output's search ends once ten steps raised its log marginal likelihood by less than this.
+        learning_rate: first step in the logarithms of the hyperparameters; the search finds its own from there.
+        tolerance: an output's search ends once five steps raised its log marginal likelihood by less than this.
         hyperparameter_rows: training rows, drawn at random where there are more, that the marginal likelihood sees; its
             cost grows with their cube. Predictions before the last step condition on the same rows.
         max_rows: training rows that the final predictions condition on, drawn at random where there are more.
@@ -84,14 +85,35 @@ class GPSettings:
             raise ValueError(f"noise_floor={self.noise_floor} must be at least 1e-10 and below 1")
 
 
-class GaussianProcess:
-    """One process an output, all rows shared; one step is one step of Rprop up the marginal likelihood.
+def bfgs(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
+    """The inverse Hessian after a step (Nocedal and Wright 2006, eq. 6.17), `... x k x k`.
 
-    Rprop follows the signs of the slopes, each hyperparameter with its own step size, which suits them better than a
-    common rate (Blum and Riedmiller, "Optimization of Gaussian Process Hyperparameters using Rprop", ESANN 2013); its
-    state is one number a hyperparameter, so it is kept by repeats like everything else. The steps are those of
-    `torch.optim.Rprop`, whose first step loads torch's compiler, 1.5 s of a process. The model has the hyperparameters
-    of the highest marginal likelihood so far (times their prior).
+    The first one, a multiple of the identity, is scaled before (eq. 6.20). Without positive curvature along the step
+    it stays as it was.
+
+    Args:
+        inverse: before, `... x k x k`.
+        step: `... x k`.
+        change: of the gradient of what is minimised, `... x k`.
+    """
+    curvature = (step * change).sum(-1)
+    usable = curvature > 1e-10 * (change * change).sum(-1)
+    scale = torch.where(usable, curvature, 1.0)[..., None, None]
+    length = (change * change).sum(-1)[..., None, None]
+    identity = torch.eye(step.shape[-1], dtype=step.dtype, device=step.device)
+    plain = (inverse - inverse[..., :1, :1] * identity == 0).flatten(-2).all(-1)[..., None, None]
+    before = torch.where(plain, identity * scale / length.clamp_min(1e-300), inverse)
+    project = identity - step.unsqueeze(-1) * change.unsqueeze(-2) / scale
+    after = project @ before @ project.mT + step.unsqueeze(-1) * step.unsqueeze(-2) / scale
+    return torch.where(usable[..., None, None], after, inverse)
+
+
+class GaussianProcess:
+    """One process an output, all rows shared; one step is one trial of BFGS up the marginal likelihood.
+
+    Each output has an inverse Hessian of its own (BFGS; Nocedal and Wright 2006, eq. 6.17), a matrix of a few numbers,
+    so that it is kept by repeats like everything else. A trial that brings too little is repeated with a shorter step.
+    The model has the hyperparameters of the highest marginal likelihood so far (times their prior).
 
     An output whose covariance has no Cholesky factor falls back to its mean, in that repeat alone, and the repeat then
     does not count as converged.
@@ -131,9 +153,10 @@ class GaussianProcess:
         self._accept(
             {
                 "theta": start,
-                "prev": torch.zeros_like(start),
-                "step_size": torch.full_like(start, settings.learning_rate),
                 "best_theta": start,
+                "slope": torch.zeros_like(start),
+                "inverse": torch.zeros_like(start).unsqueeze(-1).repeat(1, 1, 1, i + 3),
+                "length": torch.ones_like(empty),
                 "best": empty,
                 "dual": start.new_zeros(r, o, self._few),
                 "error": self._variance,
@@ -155,31 +178,17 @@ class GaussianProcess:
         return torch.where(data.weights > 0, keys, 2.0).argsort(dim=1, stable=True)[:, : self.settings.max_rows]
 
     def step(self) -> dict[str, Tensor]:
-        """One marginal likelihood of every output whose search has not ended, and one step of Rprop."""
+        """One marginal likelihood of every output whose search has not ended, and the next trial of BFGS."""
         state, settings = self._state, self.settings
-        slope = torch.zeros_like(state["theta"])
         weights = self._weights[:, : self._few]
         going = ~state["done"]
         for rows, outputs in self._chunks(going):
             few = self._rows[rows, : self._few], self._targets[rows, outputs, : self._few], weights[rows]
             found = log_evidence(settings.kernel, settings.noise_floor, state["theta"][rows, outputs], *few)
-            slope[rows, outputs] = found.slope
-            better = found.value > state["best"][rows, outputs]
             error = (found.residual.square() * few[2]).sum(-1) / few[2].sum(-1)
-            for name, value in (
-                ("best", found.value),
-                ("best_theta", state["theta"][rows, outputs]),
-                ("dual", found.dual),
-                ("error", error),
-            ):
-                take = better if value.dim() == 1 else better.unsqueeze(-1)
-                state[name][rows, outputs] = torch.where(take, value, state[name][rows, outputs])
-            # There is no way on from where the likelihood cannot be evaluated.
-            state["done"][rows, outputs] |= found.value == -torch.inf
+            self._climb(rows, outputs, found, error)
         state["evaluations"] += going.any(1)
         state["step"] += 1
-        # Where the search has ended a slope of 0 leaves everything as it is.
-        self._climb(torch.where(state["done"].unsqueeze(-1), 0.0, slope))
         if int(state["step"]) % _LOOK == 0:
             level = going & ~state["done"] & (state["best"] - state["seen"] < self.settings.tolerance)
             state["settled"] |= level
@@ -194,14 +203,31 @@ class GaussianProcess:
             "evaluations": state["evaluations"].clone(),
         }
 
-    def _climb(self, slope: Tensor) -> None:
-        """One step of Rprop up the slope, `r x o x k`, in place; none where the slope has changed its sign."""
-        theta, before, size = (self._state[name] for name in ("theta", "prev", "step_size"))
-        agreement = slope * before
-        shorter_or_same = torch.where(agreement < 0, _SHORTER * size, size)
-        size.copy_(torch.where(agreement > 0, _LONGER * size, shorter_or_same).clamp_(*_STEP_SIZES))
-        before.copy_(torch.where(agreement < 0, 0.0, slope))
-        theta.addcmul_(before.sign(), size)
+    def _climb(self, rows: Tensor, outputs: Tensor, found: Evidence, error: Tensor) -> None:
+        """Take the trials that brought enough, `b` of them with their evidence, and set out the next ones."""
+        names = ("theta", "best_theta", "best", "slope", "inverse", "length")
+        theta, best_theta, best, slope, inverse, length = (self._state[name][rows, outputs] for name in names)
+        first, step = best == -torch.inf, theta - best_theta
+        taken = found.value > -torch.inf
+        taken &= first | (found.value >= best + _PROMISED * (slope * step).sum(-1))
+        inverse = torch.where((taken & ~first)[:, None, None], bfgs(inverse, step, slope - found.slope), inverse)
+        # So long as nothing is known of the curvature: the steepest way, with a first step of this size.
+        steep = self.settings.learning_rate / found.slope.abs().amax(-1).clamp_min(_STEP_SIZES[0])
+        inverse = torch.where((taken & first)[:, None, None], torch.diag_embed(steep.unsqueeze(-1) + 0 * step), inverse)
+        slope = torch.where(taken.unsqueeze(-1), found.slope, slope)
+        best_theta = torch.where(taken.unsqueeze(-1), theta, best_theta)
+        length = torch.where(taken, 1.0, _SHORTER * length)
+        way = (inverse @ slope.unsqueeze(-1)).squeeze(-1)
+        way = way / (way.abs().amax(-1, keepdim=True) / _STEP_SIZES[1]).clamp_min(1.0)
+        next_theta = best_theta + length.unsqueeze(-1) * way
+        values = next_theta, best_theta, torch.where(taken, found.value, best), slope, inverse, length
+        for name, value in zip(names, values, strict=True):
+            self._state[name][rows, outputs] = value
+        for name, value in (("dual", found.dual), ("error", error)):
+            take = taken if value.dim() == 1 else taken.unsqueeze(-1)
+            self._state[name][rows, outputs] = torch.where(take, value, self._state[name][rows, outputs])
+        # There is no way on where the likelihood cannot be evaluated at the start.
+        self._state["done"][rows, outputs] |= first & ~taken
 
     @property
     def finished(self) -> bool:
@@ -239,7 +265,7 @@ class GaussianProcess:
         return self._network(repeat, self._final_dual(), self._spread())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Hyperparameters at this point of the search, with Rprop's memory, and those of the model: `r x o x k`."""
+        """Hyperparameters at this point of the search, with BFGS's memory, and those of the model: `r x o x k`."""
         return {name: value.detach().clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -290,7 +316,7 @@ class GaussianProcess:
         self, inputs: Tensor, dual: Tensor, spread: Tensor, ask: Callable[[GPNetwork, Tensor], Tensor]
     ) -> Tensor:
         """Ask the network of every repeat; one at a time and in pieces, since they share no matrix."""
-        size = max(1, min(4 * _CHUNK, block_size(_COPIES * 8)) // (self._shape[1] * dual.shape[-1]))
+        size = max(1, min(_CHUNK, block_size(_COPIES * 8)) // (self._shape[1] * dual.shape[-1]))
         found = []
         for repeat, points in enumerate(inputs):
             network = self._network(repeat, dual, spread)

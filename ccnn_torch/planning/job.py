@@ -122,7 +122,7 @@ def write_plan(
     make_folder(path.parent)
     write_table(path, columns)
     plot = plan_plot(mechanism.pose, plans, least_gain)
-    png, svg = save_figure(plot.figure, path)
+    svg, png = save_figure(plot.figure, path), path.with_suffix(".png")
     drawn = InlineFigure(plot.name, plot.caption, inline_svg(svg.read_text(encoding="utf-8"), plot.name))
     linked = Section(sentences=[f"![{plot.caption}]({png.name})", plot.caption])
     page, text = path.with_suffix(".html"), path.with_suffix(".md")

@@ -14,6 +14,7 @@
 | `map_place` | g x d | SI; a denser map of the workspace, where the machine is simulated |
 | `map_before`, `map_after` | g | m |
 | `mask_0`, `mask_1` … | out x in, bool | connections of the network, layer by layer |
+| `drawn.place`, `drawn.before` … | | the held-out rows of the machine's picture, see `report.machine` |
 | `weight_0`, `weight_1` … | out x (in + 1) | 1; last column = bias |
 
 Rows are in the order of the records. `history-METHOD.safetensors` holds the training curves: `step` (t, int64), and
@@ -65,6 +66,8 @@ class RunArrays:
     weights: tuple[Array, ...] = ()
     axes: tuple[Coordinate, ...] = (Coordinate("x", "m"), Coordinate("y", "m"), Coordinate("z", "m"))
     """Names and units of the `d` columns of `place`."""
+    drawn: dict[str, Array] = field(default_factory=dict)
+    """What `machine_plot` takes."""
     labels: dict[str, str] = field(default_factory=dict)
     """Words for the pictures, for example `{"method": "ccnn", "repeat": "3", "mechanism": "tripod"}`."""
 
@@ -100,6 +103,7 @@ def save_arrays(folder: str | Path, arrays: RunArrays) -> Path:
         value = getattr(arrays, entry.name)
         if isinstance(value, np.ndarray):
             tensors[entry.name] = value
+    tensors |= arrays.drawn
     tensors |= {f"mask_{i}": mask for i, mask in enumerate(arrays.masks)}
     tensors |= {f"weight_{i}": weight for i, weight in enumerate(arrays.weights)}
     about = {
@@ -124,7 +128,7 @@ def load_arrays(folder: str | Path) -> RunArrays:
     values: dict[str, NDArray[np.generic]] = {
         name: value for name, value in tensors.items() if not name.startswith(("mask_", "weight_"))
     }
-    known = {entry.name for entry in fields(RunArrays)}
+    known = {entry.name for entry in fields(RunArrays)} - {"drawn"}
     needed = ("commanded", "measured", "predicted", "test", "place", "position_before", "position_after")
     missing = [name for name in needed if name not in values]
     if missing or not {"axes", "joints"} <= about.keys():
@@ -139,6 +143,7 @@ def load_arrays(folder: str | Path) -> RunArrays:
         axes=tuple(Coordinate(str(name), str(unit)) for name, unit in about["axes"]),
         masks=masks,
         weights=weights,
+        drawn={name: value.astype(np.float64) for name, value in tensors.items() if name.startswith("drawn.")},
         labels={str(k): str(v) for k, v in about.get("labels", {}).items()},
         **{name: value for name, value in values.items() if name in known},  # type: ignore[arg-type]
     )

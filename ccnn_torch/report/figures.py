@@ -92,20 +92,21 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
 
 
 @styled
-def save_figure(figure: Figure, path: str | Path) -> list[Path]:
-    """Write a figure as PNG and as SVG; equal figures give equal bytes.
+def save_figure(figure: Figure, path: str | Path, pixels: bool = True) -> Path:
+    """Write a figure as SVG and as PNG; equal figures give equal bytes.
 
     Args:
         figure: what to write.
-        path: file name; its ending, if any, is replaced by `.png` and `.svg`.
+        path: file name; its ending, if any, is replaced by `.svg` and `.png`.
+        pixels: whether to write the PNG as well.
 
     Returns:
-        The two paths.
+        The path of the SVG.
 
     Raises:
         WriteError: they cannot be written.
     """
-    png, svg = Path(path).with_suffix(".png"), Path(path).with_suffix(".svg")
+    svg = Path(path).with_suffix(".svg")
     # The layout is found once and kept: finding it again for each file costs more than the drawing. The canvas that
     # measures the texts for it draws the PNG, too, and need not measure them again.
     figure.set_dpi(_PNG_DPI)
@@ -115,21 +116,23 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
         layout.execute(figure)
         figure.set_layout_engine("none")
     # Written by the canvases themselves: `savefig` draws everything once more beforehand, to find the layout.
-    for path, print_to, about in (
-        (png, canvas.print_png, {"Software": None}),
-        (svg, FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None}),
-    ):
-        content = io.BytesIO()
-        print_to(content, metadata=about)
-        write_whole(path, content.getvalue())
-    return [png, svg]
+    if pixels:
+        _write(svg.with_suffix(".png"), canvas.print_png, {"Software": None})
+    _write(svg, FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None})
+    return svg
+
+
+def _write(path: Path, print_to: Callable[..., None], about: dict[str, None]) -> None:
+    content = io.BytesIO()
+    print_to(content, metadata=about)
+    write_whole(path, content.getvalue())
 
 
 def inline_figures(plots: Iterable[Plot], folder: Path) -> list[InlineFigure]:
-    """Save plots as `save_figure` does, and give them as figures of a page."""
+    """Save plots as SVG, and give them as figures of a page."""
     found = []
     for plot in plots:
-        _, svg = save_figure(plot.figure, folder / plot.name)
+        svg = save_figure(plot.figure, folder / plot.name, pixels=False)
         text = inline_svg(svg.read_text(encoding="utf-8"), plot.name)
         found.append(InlineFigure(plot.name, plot.caption, text))
     return found

@@ -18,7 +18,7 @@ from ccnn_torch.training import weighted_mse
 def check_learner(factory: Callable[[], Learner], rows: int = 40) -> None:
     """Train fresh learners on small synthetic data, as one repeat and as three, and check the contract of `Learner`.
 
-    Give a factory with small budgets: the learner is trained to its end about ten times.
+    Give a factory with small budgets: the learner is trained to its end about six times.
 
     Args:
         factory: makes a fresh learner.
@@ -31,17 +31,16 @@ def check_learner(factory: Callable[[], Learner], rows: int = 40) -> None:
         data = _data(repeats, rows)
         untouched = _data(repeats, rows)
         before = global_random_state()
-        learner = _check_training(factory, data)
+        learner, error = _check_training(factory, data)
         _require(global_random_state() == before, "training changes a global random state; draw from data.seeds only")
         for part, expected in ((data.inputs, untouched.inputs), (data.targets, untouched.targets)):
             _require(torch.equal(part, expected), "training changes the data it was given")
         _check_network(learner, data)
         _check_variance(learner, data)
         _check_converged(learner, data)
-        _check_same(learner, _train(factory(), data), data, "two learners on the same data and seeds differ")
-        _check_padding(factory, data)
-        _check_training_error(factory, data)
-        _check_resume(factory, learner, data)
+        _check_padding(factory, learner, data)
+        _check_training_error(learner, error, data)
+        _check_repetition(factory, learner, data)
 
 
 def _data(repeats: int, rows: int) -> TrainingData:
@@ -64,7 +63,8 @@ def _data(repeats: int, rows: int) -> TrainingData:
     )
 
 
-def _check_training(factory: Callable[[], Learner], data: TrainingData) -> Learner:
+def _check_training(factory: Callable[[], Learner], data: TrainingData) -> tuple[Learner, Tensor]:
+    """The trained learner, and `error_train` of its last step, `r`."""
     learner = factory()
     kind = type(learner).__name__
     missing = missing_verbs(learner)
@@ -75,18 +75,18 @@ def _check_training(factory: Callable[[], Learner], data: TrainingData) -> Learn
     planned = learner.steps
     _require(isinstance(planned, int) and planned >= 1, f"steps must be a whole number of at least 1, is {planned!r}")
     taken = 0
-    evaluations = torch.zeros(len(data.seeds), dtype=torch.float64)
+    error = evaluations = torch.zeros(len(data.seeds), dtype=torch.float64)
     while not learner.finished:
         _require(taken < planned, f"the learner is not finished after the {planned} steps that it planned")
         before = evaluations
         metrics = learner.step()
         _check_metrics(metrics, len(data.seeds))
-        evaluations = metrics["evaluations"]
+        error, evaluations = metrics["error_train"], metrics["evaluations"]
         _require(bool((evaluations >= before).all()), "metric 'evaluations' falls; it counts all evaluations so far")
         taken += 1
     _require(bool((evaluations >= 1).all()), "metric 'evaluations' ends below 1; it counts passes of the training rows")
     _check_prediction(learner, data, "after the last step")
-    return learner
+    return learner, error
 
 
 def _check_metrics(metrics: dict[str, Tensor], repeats: int) -> None:
@@ -139,14 +139,10 @@ def _check_network(learner: Learner, data: TrainingData) -> None:
             _require(worst <= 1e-9, f"network({repeat}) differs from predict by {worst:.3g}")
 
 
-def _check_training_error(factory: Callable[[], Learner], data: TrainingData) -> None:
-    learner, metrics = factory(), {"error_train": torch.zeros(0)}
-    learner.start(data)
-    while not learner.finished:
-        metrics = learner.step()
+def _check_training_error(learner: Learner, told: Tensor, data: TrainingData) -> None:
     error = weighted_mse(learner.predict(data.inputs), data.targets, data.weights)
     _require(
-        bool(torch.isclose(metrics["error_train"], error, rtol=1e-9, atol=1e-12).all()),
+        bool(torch.isclose(told, error, rtol=1e-9, atol=1e-12).all()),
         "metric 'error_train' of the last step is not the model's weighted mean squared error on the training rows",
     )
 
@@ -185,45 +181,55 @@ def _check_converged(learner: Learner, data: TrainingData) -> None:
     )
 
 
-def _check_padding(factory: Callable[[], Learner], data: TrainingData) -> None:
+def _check_padding(factory: Callable[[], Learner], whole: Learner, data: TrainingData) -> None:
     padded = (data.weights == 0).unsqueeze(-1)
     other = replace(
         data,
         inputs=torch.where(padded, 3.0, data.inputs),
         targets=torch.where(padded, -1000.0, data.targets),
     )
-    one, two = _train(factory(), data).predict(data.inputs), _train(factory(), other).predict(data.inputs)
-    worst = float((one - two).abs().max())
+    worst = float((whole.predict(data.inputs) - _train(factory(), other).predict(data.inputs)).abs().max())
     _require(worst <= 1e-9, f"values in rows of weight 0 change the predictions by {worst:.3g}")
 
 
-def _check_resume(factory: Callable[[], Learner], whole: Learner, data: TrainingData) -> None:
-    for stop in sorted({0, 1, whole.steps // 2}):
-        first = factory()
-        first.start(data)
-        for _ in range(stop):
-            if not first.finished:
-                first.step()
-        state = {name: value.clone() for name, value in first.state_dict().items()}
-        for name, value in state.items():
-            _require(
-                value.dim() == 0 or len(value) == len(data.seeds),
-                f"state {name!r} has shape {tuple(value.shape)}; it must be a number or lead with the repeats",
-            )
-        second = factory()
-        second.start(data)
-        second.load_state_dict(state)
+def _check_repetition(factory: Callable[[], Learner], whole: Learner, data: TrainingData) -> None:
+    """A second training, and others that go on from states of it, end where the first one did."""
+    again, stops = factory(), {0, 1, whole.steps // 2}
+    again.start(data)
+    for step in range(whole.steps + 1):
+        if step in stops:
+            _check_resume(factory, whole, again, data, step)
+        if not again.finished:
+            again.step()
+    _check_same(whole, again, data, "two learners on the same data and seeds differ")
+
+
+def _check_resume(
+    factory: Callable[[], Learner], whole: Learner, stopped: Learner, data: TrainingData, step: int
+) -> None:
+    state = {name: value.clone() for name, value in stopped.state_dict().items()}
+    for name, value in state.items():
         _require(
-            torch.equal(first.predict(data.inputs), second.predict(data.inputs)),
-            f"predictions change when the state after step {stop} is saved and loaded",
+            value.dim() == 0 or len(value) == len(data.seeds),
+            f"state {name!r} has shape {tuple(value.shape)}; it must be a number or lead with the repeats",
         )
-        while not second.finished:
-            second.step()
-        _check_same(whole, second, data, f"a training that was stopped after step {stop} and resumed ends elsewhere")
+    resumed = factory()
+    resumed.start(data)
+    resumed.load_state_dict(state)
+    _require(
+        torch.equal(stopped.predict(data.inputs), resumed.predict(data.inputs)),
+        f"predictions change when the state after step {step} is saved and loaded",
+    )
+    _finish(resumed)
+    _check_same(whole, resumed, data, f"a training that was stopped after step {step} and resumed ends elsewhere")
 
 
 def _train(learner: Learner, data: TrainingData) -> Learner:
     learner.start(data)
+    return _finish(learner)
+
+
+def _finish(learner: Learner) -> Learner:
     while not learner.finished:
         learner.step()
     return learner

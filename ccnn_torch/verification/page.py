@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.page.data import NEXT, About
@@ -12,13 +14,21 @@ from ccnn_torch.diagnosis.page.tables import quantity_text, write_next_csv
 from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.json_files import write_json
-from ccnn_torch.report.page import Page, sections_of
+from ccnn_torch.report.page import Answer, Page, sections_of
 from ccnn_torch.report.results.verify import Error, Promised, SinceResults, VerifyResults
 from ccnn_torch.report.table import Table
 
 
-def write_since(folder: Path, results: SinceResults, joints: Sequence[Coordinate]) -> None:
-    """Write `since.json`, `since.html` and `next_measurements.csv` into a folder, which is made.
+def write_since(
+    folder: Path, results: SinceResults, joints: Sequence[Coordinate], picture: Mapping[str, Tensor]
+) -> None:
+    """Write `since.json`, `since.html`, `plots/` and `next_measurements.csv` into a folder, which is made.
+
+    Args:
+        folder: where to write.
+        results: the content of `since.json`.
+        joints: of the machine.
+        picture: as `what_changed` gives it.
 
     Raises:
         InputError: the folder cannot be written.
@@ -28,11 +38,22 @@ def write_since(folder: Path, results: SinceResults, joints: Sequence[Coordinate
         count_text(results.rows, "new row"),
         count_text(results.configurations, "configuration"),
     )
+    # Loads matplotlib, which no other command waits for.
+    from ccnn_torch.report.figures import inline_figures
+    from ccnn_torch.report.machine import machine_plot
+
+    drawn = {name: value.detach().numpy() for name, value in picture.items()}
+    after = "With what changed in it" if results.changed else "Nothing taken off"
+    plots = [plot for plot in (machine_plot(drawn, after),) if plot is not None]
+    look = " ".join(dict.fromkeys(told.look for told in results.changed))
+    answers = [Answer("Look at", look)] if look else []
+    if results.next_measurements:
+        answers.append(Answer("Measure next", f"{len(results.next_measurements)} poses: {NEXT}."))
     page = Page(
         name=f"{results.model} and {results.records}",
         kind="what changed",
         verdict=results.text,
-        sections=sections_of(since_tables(results, joints)),
+        sections=sections_of(since_tables(results, joints), inline_figures(plots, folder / "plots"), answers),
         facts=" · ".join(facts),
         notes=results.notes,
         worse=results.rest,
@@ -53,8 +74,7 @@ def since_tables(results: SinceResults, joints: Sequence[Coordinate]) -> list[Ta
             value, sd = (number_text(v / scale, 3) for v in (one.value, one.sd))
             numbers.append((told.text, one.name, f"{value} {unit}", f"{sd} {unit}", " or ".join(told.instead) or "–"))
     columns = ("what", "number", "more than in the model", "standard deviation", "these rows do not tell it from")
-    note = " ".join(dict.fromkeys(told.look for told in results.changed))
-    changed = Table("What changed?", columns, numbers, note, ("number", columns[-1])) if numbers else None
+    changed = Table("What changed?", columns, numbers, words=("number", columns[-1])) if numbers else None
     gaps = []
     first = "position" if results.position.unit == "m" else "direction"
     for kind, gap in ((first, results.position), ("rotation", results.rotation)):

@@ -39,7 +39,8 @@ from ccnn_torch.evidence.beam import search
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, covariance
 from ccnn_torch.evidence.judge import Explanation, Verdict, judge, marginal, posterior
 from ccnn_torch.evidence.priors import EFFECT
-from ccnn_torch.mechanisms import Mechanism, sees_directions
+from ccnn_torch.mechanisms import Instrument, Mechanism, sees_directions
+from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.designs import Candidates
 from ccnn_torch.report.results.verify import Change, ChangedNumber, Gap, NextPose, SinceResults, Told
@@ -61,8 +62,11 @@ _FRAMES = {"frame": "base", "tool": "tool"}
 _CHANCE = 0.01
 # A change would have been seen from so many standard deviations of its number: odds of about 20 to 1.
 _SEEN = 4.0
+# From this probability on a change is told as one: of claims above it 94 of 99 were right (docs/how_to/verify.md).
+_SURE = 0.9
 # Poses that are proposed, of so many drawn; those that say less [nat] are not worth measuring.
 _WANTED, _DRAWN, _TELLING = 5, 400, 0.01
+_SPACE = 3
 
 
 @dataclass(frozen=True)
@@ -105,8 +109,8 @@ class _Rows:
 
 def what_changed(
     model: LoadedModel, records: Any, mechanism: str | None = None, *, seed: int = 0, **how: Any
-) -> SinceResults:
-    """What changed since a model was made.
+) -> tuple[SinceResults, dict[str, Tensor]]:
+    """What changed since a model was made, and the arrays of its picture.
 
     Args:
         model, mechanism, how: as of `new_rows`.
@@ -157,7 +161,7 @@ def what_changed(
         text="",
     )
     results.text = since_text(results)
-    return results
+    return results, _drawn(rows, dictionary, verdict.chosen.best)
 
 
 def _rows_of(model: LoadedModel, machine: Mechanism, loaded: Any) -> _Rows:
@@ -183,7 +187,7 @@ def _rows_of(model: LoadedModel, machine: Mechanism, loaded: Any) -> _Rows:
         if block is None:
             raise InputError(
                 f"{model.path}: promises no error of the {kind} for new rows, so nothing says what is a change; take a "
-                "model that held rows out, an identified.yaml with its identified.json beside it (not one of sockets)"
+                "model that held rows out, an identified.yaml with its identified.json beside it, and not of distances"
             )
         kept[kind] = float(block["rms"])
         sigma[mine] = kept[kind] / math.sqrt(int(mine.sum()))
@@ -319,6 +323,18 @@ def _gap(rows: _Rows, dictionary: Dictionary, found: FittedSet, unit: str) -> Ga
     return Gap(unit="m" if length else "rad", before=rms(rows.residual), after=after, promised=promised)
 
 
+def _drawn(rows: _Rows, dictionary: Dictionary, found: FittedSet) -> dict[str, Tensor]:
+    """The machine with the errors of the new rows about the model, and what the change leaves; {} of readings."""
+    here, places = rows.situation, [k for k, channel in enumerate(rows.channels.tolist()) if channel < _SPACE]
+    if isinstance(here.mechanism, Instrument) or not places:
+        return {}
+    after = _left_out(rows, dictionary, found) if found.members else rows.residual
+    axes = rows.channels[places]
+    whole = [each.new_zeros(len(each), _SPACE).index_copy_(1, axes, each[:, places]) for each in (rows.residual, after)]
+    place = here.mechanism.frame(here.pose)[0]
+    return drawn(here.mechanism, here.joints, here.pose, place, *whole)
+
+
 def _left_out(rows: _Rows, dictionary: Dictionary, found: FittedSet) -> Tensor:
     """What a set leaves of each configuration when it is fitted to the others, `s x c` [m, rad]."""
     size = torch.cat([m.new_full((len(m),), s / 2).exp() for m, s in zip(found.mean, found.log_scale, strict=True)])
@@ -424,9 +440,10 @@ def since_text(results: SinceResults) -> str:
         said = said if results.rest else "Nothing changed that these rows show"
         return f"{said}: on {rows} the {what} is off by {before} RMS{limit} (p {results.probability:.2f})."
     changed = " and ".join(_said(one) for one in results.changed)
+    sure = "Changed" if results.probability >= _SURE else "Perhaps changed"
     more = " Beside this more is left than the model promises." if results.rest else ""
     return (
-        f"Changed since the model was made: {changed} (p {results.probability:.2f}). "
+        f"{sure} since the model was made: {changed} (p {results.probability:.2f}). "
         f"On {rows} the {what} is off by {before} RMS, and by {after} with this change, each row left out in turn"
         f"{limit}.{more}"
     )

@@ -321,7 +321,7 @@ def test_klipper_places_the_nozzle_where_the_printer_does(tmp_path: Path) -> Non
     bare = export_model(path, "klipper", tmp_path / "out")["printer.cfg"].read_text()
     assert re.search(r"# position_endstop: what is there [-+]\d+\.\d{6}", bare) and "less than" in readme
     (tmp_path / "printer.cfg").write_text("[stepper_b]\nposition_endstop: 3\n")
-    with pytest.raises(InputError, match=r"no position_endstop in \[stepper_a\]"):
+    with pytest.raises(InputError, match=r"\[stepper_a\] has no position_endstop"):
         export_model(path, "klipper", tmp_path / "out", current=tmp_path / "printer.cfg")
 
 

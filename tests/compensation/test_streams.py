@@ -210,7 +210,7 @@ def test_the_status_stands_after_inside_domain(tmp_path: Path) -> None:
     assert names[-2:] == ("inside_domain", "status") and found.damped == 2
     np.testing.assert_array_equal(read_table(tmp_path / "out.csv").column("status"), [0, 1, 2, 3, 3])
     told = sentences(tmp_path, found, loaded)[-1]
-    assert "2 of them are near a singular pose or at a limit of the joints (status = 3)" in told
+    assert "2 of them are near a singular pose or at a limit of the joints (key limits of the machine's file; " in told
     # The way back has one of its own.
     write_compensated(loaded, tmp_path / "in.csv", tmp_path / "out.csv", back=True)
     np.testing.assert_array_equal(read_table(tmp_path / "out.csv").column("status"), [3, 3, 2, 1, 0])

@@ -103,11 +103,20 @@ def _in_sockets() -> tuple[Situation, Tensor]:
 
 @pytest.fixture(scope="module")
 def sockets() -> tuple[Situation, Diagnosis]:
-    """Rows in sockets and what is found in them; down is as the first plate has it."""
+    """Rows in sockets and what is found in them."""
     situation, pose = _in_sockets()
+    return situation, diagnose_rows(situation, pose)
+
+
+def test_an_arm_stands_upright_however_its_plates_stand(sockets: tuple[Situation, Diagnosis]) -> None:
+    situation = sockets[0]
     assert situation.parameters is not None
-    down = rotation_vector_to_matrix(situation.parameters[0, 3:6]) @ situation.gravity
-    return situation, diagnose_rows(replace(situation, gravity=down), pose)
+    base = rotation_vector_to_matrix(situation.parameters[:, 3:6])
+    inside = (base.mT @ situation.down[..., None])[..., 0]
+    assert torch.allclose(inside, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand_as(inside))
+    alone = replace(situation, mechanism=situation.mechanism.with_nominal(situation.parameters[0]), parameters=None)
+    push = situation.own_weight_torque
+    assert torch.allclose(push, alone.own_weight_torque, atol=1e-9), "the same joints bear the same weight"
 
 
 def test_an_error_of_the_geometry_is_named_where_the_device_shows_two_points_alone(

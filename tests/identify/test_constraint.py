@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_folder_has_everything(folder: Path) -> None:
     names = {p.name for p in folder.iterdir()}
     assert names >= {"identified.json", "identified.csv", "identified.md", "identified.yaml", "report.html"}
-    assert {p.stem for p in (folder / "plots").glob("*.png")} >= {"pose_error", "parameters"}
+    assert {p.stem for p in (folder / "plots").glob("*.svg")} >= {"pose_error", "parameters"}
     results = json.loads((folder / "identified.json").read_text())
     jsonschema.validate(results, frozen("identified"))
     assert results["rows"] == {"train": 84, "per_leg": {}, "test": 36}

@@ -47,10 +47,10 @@ def test_the_folder_has_everything(folder: Path) -> None:
     assert list(results["methods"]) == ["lm", "lm_per_leg", "tikhonov"]
     assert set(results["parameters"]["l1"]["spread"]) >= {"value", "sd"}
     assert [c["poses"] for c in results["counts"]] == [16]
-    plots = {p.stem for p in (folder / "plots").glob("*.png")}
-    assert plots == {"pose_error", "parameters"}
+    plots = {p.stem for p in (folder / "plots").glob("*.svg")}
+    assert plots == {"machine", "pose_error", "parameters"}
     page = (folder / "report.html").read_text()
-    assert page.count("<figure") == len(plots)
+    assert page.count("<figure") == len(plots) and page.index('id="machine"') < page.index("What is known")
     assert "http" not in page.replace("http://www.w3.org", "")
     csv = (folder / "identified.csv").read_text().splitlines()
     assert csv[0] == "subject,name,quantity,unit,value,low,high"

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms.drawn import drawn
 
 ROOT = Path(__file__).parents[2]
 
@@ -64,6 +65,23 @@ def test_an_arm_ends_at_its_tool_in_its_own_base_wherever_that_stands() -> None:
     # Vectors only turn.
     further = arm.in_own_base(position + torch.tensor([0.0, 0.2, 0.0]), turned, values)[0]
     assert torch.allclose(further - inside, 0.2 * turned[1], atol=1e-12)
+
+
+def test_errors_are_drawn_beside_the_lines_wherever_an_arm_was_measured() -> None:
+    arm = load_mechanism(str(ROOT / "experiments/data/ur10.yaml"))
+    values = arm.nominal.clone()
+    values[:6] = torch.tensor([3.0, -2.0, 0.5, 0.1, 0.7, -0.4])
+    joints = arm.sample_joints(9, torch.Generator().manual_seed(1))
+    pose, place = arm.forward_kinematics(joints, values), arm.forward_frame(joints, values)[0]
+    error = torch.tensor([0.0, 1e-3, 0.0], dtype=torch.float64).expand_as(place)
+    found = drawn(arm, joints, pose, place, error, 0 * error, values)
+    reached = found["drawn.line.tool"][1]
+    assert (found["drawn.place"] - reached).norm(dim=-1).min() < 1e-12
+    assert torch.allclose(found["drawn.before"][0], arm.in_own_base(place[0], error[:1], values)[1][0])
+    sizes = drawn(arm, joints, pose, place, error.norm(dim=-1), 0 * error[:, 0], values)
+    assert torch.equal(sizes["drawn.place"], found["drawn.place"]) and sizes["drawn.before"].ndim == 1
+    lost = drawn(arm, joints, pose, torch.full_like(place, torch.nan), error, error, values)
+    assert not [name for name in lost if name.startswith("drawn.line")]
 
 
 def test_a_machine_that_does_not_draw_itself_has_no_lines() -> None:

@@ -86,6 +86,8 @@ def _arrays(floor: float, causes: dict[str, tuple[np.ndarray, np.ndarray]], rota
         "held_out": held,
         "set_aside": aside,
     }
+    kept = place + np.where(aside, np.nan, 0.0)[:, None]
+    arrays |= {"drawn.place": kept, "drawn.before": residual[:, :3] + 0, "drawn.after": noise[:, :3] + 0}
     for name, (driver, effect) in causes.items():
         arrays |= {f"signature.{name}.x": driver, f"signature.{name}.y": effect + noise[:, 0] + 12e-3 * aside}
         arrays[f"signature.{name}.fit"] = 0.97 * effect
@@ -281,6 +283,7 @@ def with_rotation() -> Case:
     arrays = _arrays(2.1e-5, {"compliance": _compliance()}, rotation=1e-3)
     generator = np.random.default_rng(1)
     arrays["place"] = torch.as_tensor(generator.uniform([-0.2, -0.2, 0.5], [0.2, 0.2, 0.7], (ROWS, 3)))
+    arrays["drawn.place"] = arrays["place"]
     return results, arrays, labels
 
 

@@ -181,7 +181,7 @@ def test_the_page_is_whole_and_fetches_nothing(folder: Path) -> None:
     assert all((folder / address).is_file() for address in outside) and "diagnosis.json" in outside
     assert text.index('class="verdict"') < text.index("<svg") < text.index("What should be measured next?")
     stems = ("machine", "signatures", "map")
-    assert {p.name for p in (folder / "plots").iterdir()} == {f"{s}.{kind}" for s in stems for kind in ("png", "svg")}
+    assert {p.name for p in (folder / "plots").iterdir()} == {f"{s}.svg" for s in stems}
 
 
 def test_a_browser_shows_all_of_the_page(folder: Path, tmp_path: Path) -> None:

@@ -184,6 +184,16 @@ def test_places_are_told_in_words() -> None:
     assert where_words(none()[0], About()) == []
 
 
+def test_of_several_joints_the_first_line_has_names_alone() -> None:
+    results, _, labels = one_effect()
+    shared = {"classes": {}, "driver": None, "probability": 0.9, "gap_before": 1e-3, "gap_after": 1e-4}
+    results["joints"] = [
+        {"joint": "q1", "effects": [], "word": "pan", **shared},
+        {"joint": "q2", "effects": ["compliance", "backlash"], "word": "elbow", **shared},
+    ]
+    assert _told(results, about_of(labels))["What is wrong"] == "Joint 2 (elbow): compliance, backlash."
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_every_case_has_its_answers(name: str) -> None:
     results, _, labels = CASES[name]()

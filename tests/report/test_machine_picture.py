@@ -1,4 +1,4 @@
-"""The picture of the machine with its errors as arrows, before and after on one scale."""
+"""The picture of the machine with its errors as arrows or circles, before and after on one scale."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from diagnosis_cases import one_effect, with_rotation
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.quiver import Quiver
 
-from ccnn_torch.diagnosis.page.figures import machine_plot
+from ccnn_torch.report.machine import machine_plot
 
 
 def _arrays() -> dict[str, np.ndarray]:
     arrays = {name: value.numpy() for name, value in one_effect()[1].items()}
-    arrays["machine.leg 1"] = np.array([[-0.2, 0.0, 0.0], [-0.3, 0.2, 0.0], [0.0, 0.3, 0.0]])
-    arrays["machine.leg 2"] = arrays["machine.leg 1"] * [-1, 1, 1]
+    arrays["drawn.line.leg 1"] = np.array([[-0.2, 0.0, 0.0], [-0.3, 0.2, 0.0], [0.0, 0.3, 0.0]])
+    arrays["drawn.line.leg 2"] = arrays["drawn.line.leg 1"] * [-1, 1, 1]
     return arrays
 
 
@@ -26,14 +27,14 @@ def _arrows(figure: Figure) -> list[Quiver]:
 
 def test_arrows_are_the_residuals_before_and_after_on_the_scale_that_is_stated() -> None:
     arrays = _arrays()
-    plot = machine_plot(arrays, ["compliance"])
+    plot = machine_plot(arrays, "With compliance in it")
     assert plot is not None
     machine, before, after = plot.figure.axes
     stated = re.search(r"(\d+) times as large on both sides", plot.caption)
     assert stated is not None and f"(arrows {stated[1]} ×)" in before.artists[0].text.get_text()
     rows = np.flatnonzero(arrays["set_aside"] < 0.5)
-    for arrows, name in zip(_arrows(plot.figure), ("residual", "remainder"), strict=True):
-        which = [int(np.argmin(np.abs(1e3 * arrays["place"][rows, 0] - x))) for x in arrows.XY[:, 0]]
+    for arrows, name in zip(_arrows(plot.figure), ("drawn.before", "drawn.after"), strict=True):
+        which = [int(np.argmin(np.abs(1e3 * arrays["drawn.place"][rows, 0] - x))) for x in arrows.XY[:, 0]]
         assert len(which) == 160 and np.allclose(
             np.stack([arrows.U, arrows.V], -1), 1e3 * float(stated[1]) * arrays[name][rows[which]][:, :2]
         )
@@ -45,20 +46,34 @@ def test_arrows_are_the_residuals_before_and_after_on_the_scale_that_is_stated()
 
 def test_the_plane_is_that_of_the_largest_extent() -> None:
     arrays = {name: value.numpy() for name, value in one_effect()[1].items()}
-    arrays["place"] = arrays["place"][:, [0, 2, 1]]
-    plot = machine_plot(arrays, ["compliance", "backlash"])
+    arrays["drawn.place"] = arrays["drawn.place"][:, [0, 2, 1]]
+    plot = machine_plot(arrays, "What is left")
     assert plot is not None and len(plot.figure.axes) == 2
     assert plot.figure.axes[0].get_ylabel() == "z [mm]"
-    assert "With the 2 effects in it" in plot.figure.axes[1].get_title(loc="left")
+    assert "What is left" in plot.figure.axes[1].get_title(loc="left")
+
+
+def test_errors_without_a_direction_are_circles_as_wide_as_they_are_large() -> None:
+    arrays = _arrays()
+    for name in ("drawn.before", "drawn.after"):
+        arrays[name] = np.linalg.norm(arrays[name], axis=1)
+    plot = machine_plot(arrays, "As identified")
+    assert plot is not None and not _arrows(plot.figure)
+    stated = re.search(r"circles as wide as the error is large, (\d+) times", plot.caption)
+    circles = [artist for artist in plot.figure.axes[1].patches if isinstance(artist, Circle)]
+    assert stated is not None and len(circles) == 160
+    place = [int(np.nanargmin(np.abs(1e3 * arrays["drawn.place"][:, 0] - c.center[0]))) for c in circles]
+    sizes = 1e3 * float(stated[1]) * arrays["drawn.before"][place]
+    assert np.allclose([2 * c.radius for c in circles], sizes)
 
 
 @pytest.mark.parametrize("change", ["still", "line", "missing"])
 def test_what_spans_no_plane_has_no_picture(change: str) -> None:
     arrays = {name: value.numpy() for name, value in with_rotation()[1].items()}
     if change == "still":
-        arrays["residual"][:, :3] = 0
+        arrays["drawn.before"][:] = 0
     elif change == "line":
-        arrays["place"][:, 1:] = 0
+        arrays["drawn.place"][:, 1:] = 0
     else:
-        del arrays["remainder"]
-    assert machine_plot(arrays, []) is None
+        del arrays["drawn.place"]
+    assert machine_plot(arrays, "after") is None

@@ -145,7 +145,7 @@ class GCode:
         self._moves.append(_Move(spans, old, max(word[3] for word in mine), target, state.absolute, state.scale))
         known = target[: len(self._axes)]
         left = "" if np.isfinite(known).all() else f"{self._lacking(known)} is not known yet"
-        self.points.append(Point(line, self._frame(known) if not left else None, left=left))
+        self.points.append(Point(line, self._frame(known) if not left else None, left=left, early=bool(left)))
 
     def _lacking(self, known: Array) -> str:
         return ", ".join(letter for letter, value in zip(self._axes, known, strict=True) if math.isnan(value))

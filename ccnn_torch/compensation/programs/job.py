@@ -238,7 +238,10 @@ def compensate_program(
     moved = corrections.apart(program.points, stands)
     said = [f"{output}: {len(moved)} of {len(program.points)} positions corrected{_by(moved)}."]
     if damped:
-        said.append(f"{damped} of them near a singular pose or at a limit, with the nearest safe command.")
+        said.append(
+            f"{damped} of them near a singular pose or at a limit of the joints (key limits of the machine's file), "
+            "with the nearest safe command."
+        )
     if loaded.covariates:
         at = ", ".join(f"{plain(c.name)} = {v:.4g}" for c, v in zip(loaded.covariates, _middle(loaded), strict=True))
         said.append(f"A program does not say the covariates; they stand in the middle of what was measured: {at}.")
@@ -247,6 +250,10 @@ def compensate_program(
             "Positions were taken in the machine's own base, of an arm for the tool of its file; give --base and "
             "--tool where the program has others."
         )
+    early = [point.line for point in program.points if point.early]
+    if early and len(moved):
+        said.append(f"Left as they are, since not all axes are known yet: {_at(early)}.")
+        reasons = ["" if p.early else why for p, why in zip(program.points, reasons, strict=True)]
     return [*said, *program.notes], _refused(input, output, program.points, reasons)
 
 
@@ -282,11 +289,12 @@ def _refused(input: Path, output: Path, points: Sequence[Point], reasons: Sequen
             lines.setdefault(reason, []).append(point.line)
     if not lines:
         return ""
-    told = "; ".join(
-        f"{reason}: line{'s' * (len(at) > 1)} {', '.join(map(str, at[:_NAMED]))}{' …' * (len(at) > _NAMED)}"
-        for reason, at in lines.items()
-    )
+    told = "; ".join(f"{reason}: {_at(at)}" for reason, at in lines.items())
     return (
         f"{output}: {sum(map(len, lines.values()))} of {len(points)} positions of {input} were left without any "
         f"correction ({told}); look at them before you run it"
     )
+
+
+def _at(lines: Sequence[int]) -> str:
+    return f"line{'s' * (len(lines) > 1)} {', '.join(map(str, lines[:_NAMED]))}{' …' * (len(lines) > _NAMED)}"

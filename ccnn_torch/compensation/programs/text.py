@@ -25,12 +25,14 @@ class Point(NamedTuple):
         frame: `4 x 4` of x, y, z [m] and orientation, a unit matrix of rotation where there is none; None of joints.
         joints: as the controller counts them [rad or m]; None of a frame.
         left: why it cannot be changed; empty where it can.
+        early: whether it stays because the machine's place is not known yet, which is nothing to look at.
     """
 
     line: int
     frame: Array | None = None
     joints: Array | None = None
     left: str = ""
+    early: bool = False
 
 
 class Edit(NamedTuple):

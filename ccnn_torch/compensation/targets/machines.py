@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,13 +20,12 @@ from ccnn_torch.compensation.targets.lowered import (
     screw,
     told_frame,
 )
-from ccnn_torch.errors import InputError, MethodFailedError
-from ccnn_torch.files.read import CONFIG_LIMIT, read_text
+from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.machines.delta import DeltaLinear
 from ccnn_torch.mechanisms.machines.stewart import Stewart
+from ccnn_torch.records.formats.klipper import STEPPERS, of_towers, sections_of, whole_text
 
-STEPPERS = ("stepper_a", "stepper_b", "stepper_c")
 # Where Klipper has its third tower [rad].
 _THIRD = math.pi / 2
 
@@ -74,13 +71,15 @@ def print_klipper(found: Found) -> Stack:
     was, now = (
         klipper_numbers(dict(zip((p.name for p in m.geometry), m.nominal.tolist(), strict=True))) for m in (inner, real)
     )
-    ends = None if found.current is None else _endstops(found.current)
+    current = found.current
+    # In mm, as Klipper reads them: what SAVE_CONFIG wrote comes last.
+    ends = None if current is None else of_towers(sections_of(whole_text(current)), current, "position_endstop")
     lines = ["[printer]", f"delta_radius: {1e3 * now[0]:.6f}"]
     for i, stepper in enumerate(STEPPERS):
         more = 1e3 * (now[3][i] - was[3][i])
         lines += ["", f"[{stepper}]", f"arm_length: {1e3 * now[1][i]:.6f}", f"angle: {now[2][i]:.6f}"]
         said = f"# position_endstop: what is there {more:+.6f}"
-        lines.append(f"position_endstop: {ends[i] + more:.6f}" if ends else said)
+        lines.append(f"position_endstop: {ends[i] + more:.6f}" if ends is not None else said)
     values = real.nominal.reshape(3, -1).clone()
     for i, row in enumerate(values):
         tower = now[4] + round(now[0], 9) * np.exp(1j * (np.radians(round(now[2][i], 6)) + now[5]))
@@ -95,23 +94,6 @@ def print_klipper(found: Found) -> Stack:
         "that lean or are skew."
     )
     return Stack({"printer.cfg": "\n".join(lines) + "\n"}, seen(values.flatten()), load)
-
-
-def _endstops(path: Path) -> list[float]:
-    """position_endstop of the three towers [mm], as Klipper reads them: what SAVE_CONFIG wrote comes last."""
-    section, found = "", dict[str, float]()
-    for line in read_text(path, CONFIG_LIMIT).splitlines():
-        line = line.removeprefix("#*#").strip()
-        header = re.fullmatch(r"\[([\w ]+)\].*", line)
-        section = header[1] if header else section
-        entry = re.fullmatch(r"position_endstop\s*[:=]\s*([-+]?[\d.]+)\s*(?:#.*)?", line)
-        if entry and section in STEPPERS:
-            found[section] = float(entry[1])
-    # Those of the others are that of the first where they have none.
-    found = {name: found.get(name, found.get(STEPPERS[0], math.nan)) for name in STEPPERS}
-    if any(map(math.isnan, found.values())):
-        raise InputError(f"{path}: has no position_endstop in [stepper_a]; give the printer.cfg of a delta printer")
-    return [found[name] for name in STEPPERS]
 
 
 def print_hal(found: Found) -> Stack:

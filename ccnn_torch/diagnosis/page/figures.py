@@ -1,8 +1,7 @@
-"""Pictures of a diagnosis: signatures of effects, the machine with its errors, the gap over the workspace, a motion."""
+"""Pictures of a diagnosis: signatures of effects, the gap over the workspace, a motion."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,9 +12,7 @@ from numpy.typing import NDArray
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.page.data import About, Signature, used_rows
-from ccnn_torch.display import display_unit, number_text, unit_text
-from ccnn_torch.effects import OUTLIER
-from ccnn_torch.effects.words import words_of
+from ccnn_torch.display import display_unit, unit_text
 from ccnn_torch.motion.stretches import PHASES
 from ccnn_torch.report.figures import (
     AFTER,
@@ -157,134 +154,6 @@ def _explained(y: Array, fit: Array) -> float | None:
     if known.sum() < 3 or not (variance := float(np.square(y[known]).mean())):
         return None
     return max(0.0, 1 - float(np.square((y - fit)[known]).mean()) / variance)
-
-
-# The prefix of the lines' names among the arrays.
-_LINES = "machine."
-# More arrows than this hide each other.
-_MOST_ARROWS = 160
-# Length of a large arrow, the 90 % quantile, as a share of the width of the poses.
-_LENGTH = 0.12
-# Of the width below which a machine has no second direction.
-_FLAT = 1e-3
-
-
-@styled
-def machine_plot(arrays: Arrays, effects: Sequence[str]) -> Plot | None:
-    """Position residuals as arrows at the measured poses, in the plane of largest extent, before and after.
-
-    Args:
-        arrays: `place`, `residual`, `remainder` as `write_diagnosis_report` takes them, and the machine's lines,
-            `machine.NAME` `k x 3` [m]; without these the machine is left out.
-        effects: of the verdict.
-
-    Returns:
-        None where the machine has no position that spans a plane, or no gap in it.
-    """
-    if not all(name in arrays for name in ("place", "residual", "remainder")) or arrays["residual"].shape[1] < 3:
-        return None
-    place, before, after = (arrays[name][:, :3] for name in ("place", "residual", "remainder"))
-    _, aside = used_rows(arrays, len(place))
-    rows = ~aside & np.isfinite(place + before + after).all(-1)
-    place, before, after = place[rows], before[rows], after[rows]
-    plane = _widest_plane(place, before)
-    if not plane:
-        return None
-    width = float(np.ptp(place[:, plane], axis=0).max())
-    long = float(np.quantile(np.linalg.norm(before[:, plane], axis=1), 0.9))
-    if not long > 0:
-        return None
-    times = _round(_LENGTH * width / long)
-    # Every so many rows, in their order: the same file gives the same picture.
-    chosen = np.unique(np.linspace(0, len(place) - 1, min(len(place), _MOST_ARROWS)).round().astype(int))
-    lines = {name.removeprefix(_LINES): value for name, value in arrays.items() if name.startswith(_LINES)}
-    everything = np.concatenate([*lines.values(), place])
-    shapes = [np.ptp(values[:, plane[1]]) / np.ptp(values[:, plane[0]]) for values in (everything, place)]
-    inches = (10.2 if lines else 7.6, 1.2 + 2.8 * float(np.clip(max(shapes), 0.4, 1.3)))
-    figure = Figure(figsize=inches, layout="constrained")
-    panels = list(figure.subplots(1, 3 if lines else 2, squeeze=False)[0])
-    if lines:
-        _draw_machine(panels.pop(0), lines, place, plane)
-    sizes = [_rms(values) for values in (before, after)]
-    scale, unit = display_unit("m", sizes[0])
-    found = [words_of(name).short for name in effects if name != OUTLIER]
-    after_words = f"With {found[0]} in it" if len(found) == 1 else f"With the {len(found)} effects in it"
-    titles = ("Model as it is", after_words if found else "What is left")
-    key = _round(long)
-    key_scale, key_unit = display_unit("m", key)
-    label = f"{key / key_scale:g} {key_unit} (arrows {times:g} ×)"
-    across, up = (1e3 * place[chosen][:, i] for i in plane)
-    for axes, values, size, title, colour in zip(panels, (before, after), sizes, titles, (BEFORE, AFTER), strict=True):
-        axes.scatter(across, up, s=5, color=GREY, linewidths=0)
-        arrows = axes.quiver(
-            across,
-            up,
-            *(1e3 * times * values[chosen][:, i] for i in plane),
-            angles="xy",
-            scale_units="xy",
-            scale=1.0,
-            color=colour,
-            width=0.005,
-        )
-        axes.quiverkey(arrows, 0.01, 1.05, 1e3 * times * key, label, labelpos="E", fontproperties={"size": 8.5})
-        axes.set_title(f"{title}\nRMS {number_text(size / scale, 3)} {unit}", pad=19)
-        _frame(axes, plane, place, _LENGTH * width)
-    shown = "" if len(chosen) == len(place) else f", {len(chosen)} of {len(place)} rows"
-    beside = "The machine in the middle of the measured poses (dots); where " if lines else "Where "
-    caption = (
-        f"{beside}it stops, measured from where the model says, drawn {times:g} times as large on both sides{shown}, "
-        f"in the robot's frame: {number_text(sizes[0] / scale, 3)} → {number_text(sizes[1] / scale, 3)} {unit} RMS."
-    )
-    return Plot("machine", figure, caption)
-
-
-def _widest_plane(place: Array, gap: Array) -> list[int]:
-    """The two axes along which places `s x 3` extend most; none where they span no plane, or no gap has a direction."""
-    if len(place) < 2 or not np.abs(gap[:, 1:]).max() > 0:
-        return []
-    extent = np.ptp(place, axis=0)
-    plane = sorted(np.argsort(-extent, kind="stable")[:2].tolist())
-    return plane if extent[plane].min() > _FLAT * extent.max() else []
-
-
-def _draw_machine(axes: Axes, lines: Mapping[str, Array], place: Array, plane: list[int]) -> None:
-    """Legs or links with their numbers, and the poses that were measured."""
-    axes.scatter(1e3 * place[:, plane[0]], 1e3 * place[:, plane[1]], s=4, color=GREY, linewidths=0)
-    everything = np.concatenate([*lines.values(), place])
-    wide = float(np.ptp(everything[:, plane], axis=0).max())
-    labelled: list[Array] = []
-    for name, line in lines.items():
-        kind, _, number = name.partition(" ")
-        thin = kind not in ("leg", "link")
-        across, up = (1e3 * line[:, i] for i in plane)
-        axes.plot(across, up, color=FLOOR, linewidth=1.2 if thin else 2.4, zorder=3)
-        axes.scatter(across, up, s=12, color="#222222", zorder=4)
-        start = line[0, plane]
-        # Numbers of a wrist would lie on each other.
-        if number and all(np.linalg.norm(start - other) > 0.06 * wide for other in labelled):
-            labelled.append(start)
-            at = (1e3 * start[0], 1e3 * start[1])
-            axes.annotate(number, at, textcoords="offset points", xytext=(5, 4), fontsize=9, fontweight="bold")
-    axes.set_title("The machine\nand the poses")
-    _frame(axes, plane, everything, 0.06 * wide)
-
-
-def _frame(axes: Axes, plane: list[int], points: Array, margin: float) -> None:
-    """Axes in mm on one scale around points `s x 3` [m]."""
-    axes.set(xlabel=f"{'xyz'[plane[0]]} [mm]", ylabel=f"{'xyz'[plane[1]]} [mm]")
-    ends = [(1e3 * (points[:, i].min() - margin), 1e3 * (points[:, i].max() + margin)) for i in plane]
-    axes.set(xlim=ends[0], ylim=ends[1])
-    axes.set_aspect("equal")
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.square(values).sum(-1).mean()))
-
-
-def _round(value: float) -> float:
-    """The largest of 1, 2, 5, 10, 20 … that is not above."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next(step * power for step in (5.0, 2.0, 1.0) if step * power <= value * (1 + 1e-12))
 
 
 @styled

@@ -88,6 +88,12 @@ def _line(row: Sequence[str]) -> str:
 def _wrong(results: Block) -> str:
     verdict, open_ = results["verdict"], undetermined(results)
     found = [f.text for f in findings(results)]
+    if len(joints := results.get("joints", [])) > 1 and verdict["effects"]:
+        # Numbers, and what cannot be told from what, are in the table.
+        each = [(one, ", ".join(words_of(e).short for e in one["effects"])) for one in joints]
+        named = [(_joint(one["joint"]), one.get("word"), names) for one, names in each if names]
+        found = [f"{joint} ({word}): {names}" if word else f"{joint}: {names}" for joint, word, names in named]
+        return f"{capital('; '.join(found))}."
     if verdict["none"]:
         if open_:
             return f"{capital(open_)}; the likeliest: nothing beyond the noise."

@@ -25,6 +25,7 @@ from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Instrument, Mechanism, SerialArm
+from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.mechanisms.pose import CHANNELS
 from ccnn_torch.report.json_files import plain, write_json
@@ -113,7 +114,7 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
 
     Returns:
         Arrays by name (`s` rows, `c` pose channels, SI): `place` `s x 3`, `joints` `s x n`, `residual` and `remainder`
-        `s x c`, all in the robot's frame; the machine's legs or links, `machine.NAME` `k x 3`; `noise` `c`, `held_out`
+        `s x c`, all in the robot's frame; `drawn.*` as `report.machine` takes them; `noise` `c`, `held_out`
         and `set_aside` `s`, `covariate.NAME` `s`, and for each effect of the verdict and the driver outside the library
         `signature.NAME.x`, `.y` and `.fit` `s`. The remainder of each row is that of a fit to other rows. And
         the names and units of the signatures' axes, `{NAME: {"x": {"name", "unit"}, …}}`.
@@ -128,17 +129,17 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     # The analysis' own residual is about the machine with the effects.
     residual = pose_residual(situation, analysis.measured)
     remainder = _remainder(analysis, residual, found.members, seed)
-    inside, drawn, left = _in_robot_frame(situation, torch.nan_to_num(place), residual, remainder)
+    inside, turned, left = _in_robot_frame(situation, torch.nan_to_num(place), residual, remainder)
     arrays = {
         "place": inside,
         "joints": situation.joints,
-        "residual": drawn,
+        "residual": turned,
         "remainder": left,
         "noise": _noise(analysis),
         "held_out": held,
         "set_aside": 1 - held,
     }
-    arrays |= _machine(situation, inside, keep) if not isinstance(situation.mechanism, Instrument) else {}
+    arrays |= _drawn(situation, place, residual, remainder, held > 0)
     arrays |= {f"covariate.{name}": value for name, value in situation.covariates.items()}
     labels: dict[str, Any] = {}
     parts = [analysis.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
@@ -164,6 +165,18 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     return {name: value.to(torch.float64) for name, value in arrays.items()}, labels
 
 
+def _drawn(situation: Situation, place: Tensor, residual: Tensor, remainder: Tensor, keep: Tensor) -> dict[str, Tensor]:
+    """The picture of the machine, without the rows that were set aside; readings have a size, and no direction."""
+    arm = situation.mechanism
+    if isinstance(arm, Instrument):
+        place = situation.whole.platform[0]
+        before, after = (_sizes(arm, values)[:, 0] for values in (residual, remainder))
+    else:
+        before, after = residual[:, :3], remainder[:, :3]
+    place = torch.where(keep[:, None], place, torch.nan)
+    return drawn(arm, situation.joints, situation.pose, place, before, after, situation.parameters)
+
+
 def _in_robot_frame(
     situation: Situation, place: Tensor, residual: Tensor, remainder: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -185,16 +198,6 @@ def _sizes(mechanism: Mechanism, values: Tensor) -> Tensor:
     angles = torch.tensor([c.unit == "rad" for c in mechanism.channels])
     parts = [values[:, ~angles], *([values[:, angles]] if bool(angles.any()) else [])]
     return torch.cat([torch.nn.functional.pad(part.norm(dim=-1, keepdim=True), (0, 2)) for part in parts], -1)
-
-
-def _machine(situation: Situation, place: Tensor, keep: Tensor) -> dict[str, Tensor]:
-    """The machine's legs or links, `machine.NAME` `k x 3` [m], in the row next to the middle of all."""
-    here = place[keep]
-    row = int(keep[(here - here.median(0).values).square().sum(-1).argmin()])
-    parameters = situation.parameters
-    values = None if parameters is None else parameters.expand(len(place), -1)[row]
-    lines = situation.mechanism.skeleton(situation.pose[row], situation.joints[row], values)
-    return {f"machine.{name}": line for name, line in lines.items()}
 
 
 def _noise(analysis: Analysis) -> Tensor:

@@ -41,6 +41,8 @@ from ccnn_torch.diagnosis.page.tables import (
 )
 from ccnn_torch.diagnosis.verdict.text import aside_text, listed, network_text, size_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text
+from ccnn_torch.effects import OUTLIER
+from ccnn_torch.effects.words import words_of
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.arrays import load_tensors, save_tensors
 from ccnn_torch.report.json_files import read_json, write_json
@@ -76,7 +78,7 @@ def write_diagnosis_report(
         results: the content of `diagnosis.json`, which is read when None.
         arrays: what is drawn in the figures (`s` rows in the order of the file, `c` pose channels, float64, SI):
             `place` `s x 3`, `joints` `s x n`, `residual` and `remainder` `s x c`, `held_out` and `set_aside` `s`, the
-            machine's legs or links `machine.NAME` `k x 3`, and `signature.EFFECT.x`, `.y` and `.fit` `s`; written to
+            arrays of `report.machine`, and `signature.EFFECT.x`, `.y` and `.fit` `s`; written to
             the folder first, or read from it when None. Of a motion what `course_plot` takes.
         labels: names and units of the signatures' axes, `{EFFECT: {"x": {"name", "unit"}, "y": …}}`, and under `about`
             what `About` holds; written or read like the arrays.
@@ -176,12 +178,15 @@ def _notes(results: Block, about: About) -> list[str]:
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
-    from ccnn_torch.diagnosis.page.figures import course_plot, machine_plot, remainder_map, signature_plot
+    from ccnn_torch.diagnosis.page.figures import course_plot, remainder_map, signature_plot
+    from ccnn_torch.report.machine import machine_plot
 
     effects = list(results["verdict"]["effects"])
+    found = [words_of(name).short for name in effects if name != OUTLIER]
+    words = found[0] if len(found) == 1 else f"the {len(found)} effects"
     plots = (
         course_plot(results, arrays),
-        machine_plot(arrays, effects),
+        machine_plot(arrays, f"With {words} in it" if found else "What is left"),
         signature_plot(signatures_of(arrays, labels, effects), arrays, effects),
         remainder_map(arrays, about),
     )

@@ -9,7 +9,7 @@ and the smallest probability counts for as many families as were tried.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations
 from typing import NamedTuple
 
@@ -59,13 +59,15 @@ class _Block(NamedTuple):
         driver: what they follow.
         family: those among which the strongest counts.
         values: `s x m`.
-        through: "channels", "joints", one of them: "channel 0", "joint 0".
+        through: "channel" or "joint".
+        which: of them; None = each.
     """
 
     driver: str
     family: str
     values: Tensor
     through: str
+    which: int | None = None
 
 
 # Probability below which a remainder is no noise, where it is more than the form errors of the effects would be along
@@ -129,16 +131,17 @@ def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
     total = rest.every.square().sum(0) - (rest.basis.mT @ rest.every).square().sum(0)
     best: dict[str, Tensor] = {}
     strongest: tuple[float, _Block] | None = None
-    for block, explained, count in _explained([*_blocks(_drivers(analysis, keep[taken]), channels)], rest):
-        if not count or free - count < _FEWEST:
-            continue
-        ratio = (explained / count) / ((total - explained).clamp_min(1e-300) / (free - count))
-        score = _surprise(ratio, count, free - count)
-        best[block.family] = torch.maximum(score, best.get(block.family, score))
+    for alike, explained, count in _explained(_blocks(_drivers(analysis, keep[taken]), channels), rest):
+        spare = (free - count).clamp_min(1.0)
+        unexplained = (total - explained).clamp_min(1e-300)
+        score = _surprise(explained / count.clamp_min(1.0) * spare / unexplained, count, spare)
         # Of many drivers that go together the one that needs least for it (Schwarz 1978).
-        evidence = float(free * (total / (total - explained))[0].log() - count * math.log(free)) / 2
-        if strongest is None or evidence > strongest[0]:
-            strongest = evidence, block
+        evidence = (free * (total / unexplained)[:, :1].log() - count * math.log(free)) / 2
+        for i in torch.nonzero((count > 0) & (free - count >= _FEWEST))[:, 0].tolist():
+            block = alike[i]
+            best[block.family] = torch.maximum(score[i], best.get(block.family, score[i]))
+            if strongest is None or float(evidence[i]) > strongest[0]:
+                strongest = float(evidence[i]), block
     if strongest is None:
         return None
     block = strongest[1]
@@ -150,7 +153,7 @@ def remainder_of(analysis: Analysis, found: FittedSet) -> Remainder | None:
 def _excess(block: _Block, rest: _Left) -> float:
     """As in `Remainder`: in units of a channel's own noise, since one may be far noisier than the others."""
     channels = rest.jacobian.shape[1]
-    own = _basis(_columns([block], rest)[0])
+    own = _basis(_columns(block, rest))
     left = rest.every[:, 1]
     found = own @ (own.mT @ left)
     noise = (left - found).square().sum() / max(len(left) - rest.basis.shape[1] - own.shape[1], 1)
@@ -205,63 +208,76 @@ def _blocks(drivers: Mapping[str, Tensor], channels: int) -> Iterator[_Block]:
     joints = [name for name in drivers if name.startswith("joint ")]
     for name, value in drivers.items():
         smooth = _polynomials(value, _DEGREE) if _is_many(value) else value[:, None]
-        yield _Block(name, "smooth", smooth, "channels")
-        yield _Block(name, "smooth", smooth, "joints")
-        yield from (_Block(name, "channel", smooth, f"channel {k}") for k in range(channels))
+        yield from (_Block(name, "smooth", smooth, through) for through in ("channel", "joint"))
+        yield from (_Block(name, "channel", smooth, "channel", k) for k in range(channels))
     for i, name in enumerate(joints):
         waves = drivers[name][:, None] * torch.pi * torch.tensor(_WAVES)
-        yield _Block(
-            name, "own", torch.cat([_polynomials(drivers[name], _DEGREE), waves.sin(), waves.cos()], -1), f"joint {i}"
-        )
+        shapes = torch.cat([_polynomials(drivers[name], _DEGREE), waves.sin(), waves.cos()], -1)
+        yield _Block(name, "own", shapes, "joint", i)
     for name in (n for n in drivers if n.startswith("direction ") and n[10:].isdigit()):
         i, value = int(name[10:]) - 1, drivers[name][:, None]
         if i >= len(joints):
             continue
         own = torch.cat([torch.ones_like(value), _polynomials(drivers[joints[i]], 4)], -1)
-        yield _Block(name, "direction", value * own, f"joint {i}")
+        yield _Block(name, "direction", value * own, "joint", i)
         for other in (n for n, v in drivers.items() if n != name and _is_many(v)):
             both = value * _polynomials(drivers[other], 2)
-            yield _Block(name + CROSS + other, "direction pair", both, f"joint {i}")
+            yield _Block(name + CROSS + other, "direction pair", both, "joint", i)
     rows = len(next(iter(drivers.values())))
     steps = (torch.arange(rows) >= (k * rows) // (2 * _PARTS) for k in range(1, 2 * _PARTS))
     for step in steps:
-        yield from (_Block("time", "step", step.double()[:, None], way) for way in ("channels", "joints"))
+        yield from (_Block("time", "step", step.double()[:, None], way) for way in ("channel", "joint"))
     for one, other in combinations(drivers, 2):
         both = (drivers[one] * drivers[other])[:, None]
-        yield from (_Block(one + CROSS + other, "pair", both, way) for way in ("channels", "joints"))
+        yield from (_Block(one + CROSS + other, "pair", both, way) for way in ("channel", "joint"))
 
 
-def _explained(blocks: list[_Block], rest: _Left) -> Iterator[tuple[_Block, Tensor, int]]:
-    """Squares of what is left, and of every order drawn, that each block explains beside what was fitted, and by how
-    many directions; blocks of one shape at once."""
-    _, channels, joints = rest.jacobian.shape
-    kinds: dict[tuple[int, int], list[_Block]] = {}
+def _explained(blocks: Iterable[_Block], rest: _Left) -> Iterator[tuple[list[_Block], Tensor, Tensor]]:
+    """Blocks of one shape, the squares of what is left and of every order drawn that each explains beside what was
+    fitted, `b x p`, and by how many directions, `b x 1`.
+
+    A column is the product of a function of the rows and of a map to the channels. Its scalar products are taken
+    through the map first, so that no column is formed.
+    """
+    rows, channels, _ = rest.jacobian.shape
+    fitted, along = rest.basis.shape[1], rest.basis.mT @ rest.every
+    every = torch.cat([rest.basis, rest.every], -1).reshape(rows, channels, -1)
+    maps = {kind: _map(kind, None, rest) for kind in ("channel", "joint")}
+    mapped = {kind: (m.mT @ m, m.mT @ every) for kind, m in maps.items()}
+    kinds: dict[tuple[str, int | None, int], list[_Block]] = {}
     for block in blocks:
-        width = {"channels": channels, "joints": joints}.get(block.through, 1)
-        kinds.setdefault((width, block.values.shape[-1]), []).append(block)
-    for alike in kinds.values():
-        columns = _columns(alike, rest)
-        values_of, vectors = torch.linalg.eigh(columns.mT @ columns)
+        kinds.setdefault((block.through, block.which, block.values.shape[-1]), []).append(block)
+    for (through, which, _), alike in kinds.items():
+        part = slice(None) if which is None else slice(which, which + 1)
+        values, squares, seen = torch.stack([b.values for b in alike]), *mapped[through]
+        gram = torch.einsum("bsm,bsn,svw->bmvnw", values, values, squares[:, part, part]).flatten(3).flatten(1, 2)
+        products = torch.einsum("bsm,svp->bmvp", values, seen[:, part]).flatten(1, 2)
+        size = (gram.diagonal(dim1=-2, dim2=-1) / (rows * channels)).clamp_min(1e-300).sqrt()[..., None]
+        on_fitted, on_left = (products / size).tensor_split([fitted], -1)
+        gram = gram / size / size.mT - on_fitted @ on_fitted.mT
+        own = gram.diagonal(dim1=-2, dim2=-1)[..., None] > _OWN * rows * channels
+        gram, on_left = gram * own * own.mT, (on_left - on_fitted @ along) * own
+        values_of, vectors = torch.linalg.eigh(gram)
         kept = values_of > _INDEPENDENT * values_of.amax(-1, keepdim=True).clamp_min(1e-300)
-        along = (vectors.mT @ (columns.mT @ rest.every)).square() / values_of.clamp_min(1e-300)[..., None]
-        explained = torch.where(kept[..., None], along, 0.0).sum(1)
-        counts = torch.where(values_of.amax(-1) > 0, kept.sum(-1), 0)
-        yield from zip(alike, explained, counts.tolist(), strict=True)
+        explained = (vectors.mT @ on_left).square() / values_of.clamp_min(1e-300)[..., None]
+        kept &= values_of.amax(-1, keepdim=True) > 0
+        yield alike, torch.where(kept[..., None], explained, 0.0).sum(1), kept.sum(-1, keepdim=True).double()
 
 
-def _columns(alike: list[_Block], rest: _Left) -> Tensor:
-    """What blocks of one shape do beside what was fitted, `b x (s c) x m`; 0 where that is next to nothing."""
-    rows, channels, joints = rest.jacobian.shape
-    eye = torch.eye(channels, dtype=torch.float64).expand(rows, -1, -1)
-    through = {"channels": eye, "joints": rest.jacobian}
-    through |= {f"channel {k}": eye[..., [k]] for k in range(channels)}
-    through |= {f"joint {i}": rest.jacobian[..., [i]] for i in range(joints)}
-    maps = torch.stack([through[b.through] for b in alike])
-    values = torch.stack([b.values for b in alike])
-    columns = (maps[..., None] * values[:, :, None, None, :]).reshape(len(alike), rows * channels, -1)
-    columns = columns / columns.square().mean(1, keepdim=True).sqrt().clamp_min(1e-300)
+def _map(through: str, which: int | None, rest: _Left) -> Tensor:
+    """Of a block to the channels, `s x c x w`."""
+    rows, channels, _ = rest.jacobian.shape
+    found = rest.jacobian if through == "joint" else torch.eye(channels, dtype=torch.float64).expand(rows, -1, -1)
+    return found if which is None else found[..., [which]]
+
+
+def _columns(block: _Block, rest: _Left) -> Tensor:
+    """What a block does beside what was fitted, `(s c) x m`; 0 where that is next to nothing."""
+    columns = _map(block.through, block.which, rest)[..., None, :] * block.values[:, None, :, None]
+    columns = columns.flatten(2).flatten(0, 1)
+    columns = columns / columns.square().mean(0).sqrt().clamp_min(1e-300)
     columns = columns - rest.basis @ (rest.basis.mT @ columns)
-    kept: Tensor = columns * (columns.square().mean(1, keepdim=True) > _OWN)
+    kept: Tensor = columns * (columns.square().mean(0) > _OWN)
     return kept
 
 
@@ -309,9 +325,9 @@ def _polynomials(value: Tensor, degree: int) -> Tensor:
     return values
 
 
-def _surprise(ratio: Tensor, first: int, second: int) -> Tensor:
+def _surprise(ratio: Tensor, first: Tensor, second: Tensor) -> Tensor:
     """Minus the logarithm of the probability of a larger F ratio (Paulson 1942)."""
-    a, b, root = 2 / (9 * first), 2 / (9 * second), ratio.clamp_min(0).pow(1 / 3)
+    a, b, root = 2 / (9 * first.clamp_min(1.0)), 2 / (9 * second), ratio.clamp_min(0).pow(1 / 3)
     score: Tensor = -torch.special.log_ndtr(((1 - a) - (1 - b) * root) / (a + b * root.square()).sqrt())
     return score
 

@@ -62,7 +62,7 @@ FORMS = (
         "a LeRobot data set",
         "lerobot",
         lambda path: _has("meta/info.json")(path) or _has("data/*/*.parquet")(path),
-        ("episodes", "joints", "units", "calibration"),
+        ("episodes", "joints", "units", "calibration", "effort", "velocity"),
         motion=True,
     ),
     Form(

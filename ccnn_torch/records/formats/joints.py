@@ -93,6 +93,7 @@ def motion_table(
     position: Array,
     run: Array,
     notes: Sequence[str],
+    beside: Mapping[str, tuple[str, Array]] | None = None,
 ) -> Table:
     """The table of a log.
 
@@ -104,11 +105,13 @@ def motion_table(
         command, position: `s x n`.
         run: `s`.
         notes: one sentence each without a full stop.
+        beside: unit and values `s x n` of what else was recorded of each joint, by our name.
     """
     listed = ", ".join(f"q{i + 1} is {name}" for i, name in enumerate(joints.names))
     columns = {"time": ("s", time), "run": ("1", run)}
     for i, unit in enumerate(units):
         columns |= {f"command{i + 1}": (unit, command[:, i]), f"q{i + 1}": (unit, position[:, i])}
+        columns |= {f"{name}{i + 1}": (own, values[:, i]) for name, (own, values) in (beside or {}).items()}
     return Table(
         str(path),
         {name: unit for name, (unit, _) in columns.items()},

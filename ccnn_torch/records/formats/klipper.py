@@ -22,9 +22,11 @@ from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 
 Array = NDArray[np.float64]
 _SECTION, _KEY = re.compile(r"\[([^\]]+)\]"), re.compile(r"([\w-]+)\s*[:=]\s*(.*)")
+_INCLUDE = re.compile(r"\s*\[include\s+([^\]]+)\]")
 _SAVED = "#*#"
+STEPPERS = ("stepper_a", "stepper_b", "stepper_c")
 _TOWERS = (210.0, 330.0, 90.0)
-_MOST = 999
+_MOST, _DEEPEST = 999, 20
 # The object that is printed for DELTA_ANALYZE: six pillars around one in the middle, the first at tower A [deg, mm].
 _PILLARS = np.radians(210.0 + 60.0 * np.arange(6))
 _RADIUS, _RIDGE = 65.0, 4.5
@@ -58,8 +60,8 @@ def read_printer(path: Path) -> Printer | None:
     """
     if path.suffix.lower() != ".cfg" or not path.is_file():
         return None
-    text = read_text(path, CONFIG_LIMIT)
-    config = _sections(text)
+    text = whole_text(path)
+    config = sections_of(text)
     if "kinematics" not in config.get("printer", {}):
         return None
     if config["printer"]["kinematics"] != "delta":
@@ -67,18 +69,14 @@ def read_printer(path: Path) -> Printer | None:
             f"{path}: [printer] has kinematics: {visible(config['printer']['kinematics'], 40)}; give that of a delta"
         )
     radius = _number(config, path, "printer", "delta_radius")
-    steppers = [f"stepper_{axis}" for axis in "abc"]
-    rods, ends = (
-        np.array([_number(config, path, s, key, _number(config, path, steppers[0], key)) for s in steppers])
-        for key in ("arm_length", "position_endstop")
-    )
+    rods, ends = (of_towers(config, path, key) for key in ("arm_length", "position_endstop"))
     if not (0 < radius < rods.min()):
         raise InputError(
             f"{path}: arm_length {rods.min():g} must be longer than delta_radius {radius:g}, and both above 0"
         )
-    towers = np.array([_number(config, path, s, "angle", own) for s, own in zip(steppers, _TOWERS, strict=True)])
+    towers = np.array([_number(config, path, s, "angle", own) for s, own in zip(STEPPERS, _TOWERS, strict=True)])
     top = ends + np.sqrt(rods**2 - radius**2)
-    steps = np.array([_step(config, path, s) for s in steppers])
+    steps = np.array([_step(config, path, s) for s in STEPPERS])
     about = config.get("delta_calibrate", {})
 
     def place(key: str) -> Array:
@@ -139,7 +137,36 @@ def _table(names: str, rows: Array) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _sections(text: str) -> dict[str, dict[str, str]]:
+def of_towers(config: Mapping[str, Mapping[str, str]], path: Path, key: str) -> Array:
+    """A number of each tower, `3`; those of the others are that of the first where they have none.
+
+    Raises:
+        InputError: the first has none, or one is no number.
+    """
+    first = _number(config, path, STEPPERS[0], key)
+    return np.array([_number(config, path, name, key, first) for name in STEPPERS])
+
+
+def whole_text(path: Path, above: tuple[Path, ...] = ()) -> str:
+    """The text of a file with those that it includes in their places, as Klipper reads them; above: who includes it."""
+    if path.resolve() in above or len(above) > _DEEPEST:
+        raise InputError(f"{path}: includes itself; remove that [include …]")
+    parts = []
+    for line in read_text(path, CONFIG_LIMIT).splitlines():
+        found = _INCLUDE.match(line)
+        parts += [line] if found is None else _included(path, found[1].strip(), (*above, path.resolve()))
+    return "\n".join(parts)
+
+
+def _included(path: Path, name: str, above: tuple[Path, ...]) -> list[str]:
+    there = sorted(path.parent.glob(name)) if not Path(name).is_absolute() else [Path(name)]
+    files = [file for file in there if file.is_file()]
+    if not files and not re.search(r"[*?\[]", name):
+        raise InputError(f"{path}: [include {visible(name, 60)}]: there is no such file beside it; copy it there")
+    return [whole_text(file, above) for file in files]
+
+
+def sections_of(text: str) -> dict[str, dict[str, str]]:
     """Values by section and key, those that SAVE_CONFIG wrote over the others."""
     found: dict[str, dict[str, str]] = {}
     section = ""
@@ -160,7 +187,7 @@ def _number(
     if text is None and usual is not None:
         return usual
     if text is None:
-        raise InputError(f"{path}: [{section}] has no {key}; write it there (files that it includes are not read)")
+        raise InputError(f"{path}: [{section}] has no {key}; write it there")
     return float(_numbers(text, 1, f"{path}: [{section}] {key}")[0])
 
 

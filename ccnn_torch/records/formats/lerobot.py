@@ -27,6 +27,11 @@ _EPISODES = 16
 # Numbers in a column of one file: 1,000 hours of a 14-joint arm at 30 Hz.
 _MOST = 50_000_000
 _STATE, _ACTION, _TIME, _EPISODE = "observation.state", "action", "timestamp", "episode_index"
+# What else may be recorded of each joint, by its key: our column by the unit that is said.
+_BESIDE = {
+    "effort": {"N*m": "torque", "A": "current", "mA": "current", "1": "pwm"},
+    "velocity": {"rad/s": "speed", "deg/s": "speed", "m/s": "speed", "mm/s": "speed"},
+}
 # Beyond this an angle in radians has made more than a turn, and one in a share of its range is outside of it.
 _RAD, _SHARE = 2 * np.pi, 100.5
 # Steps of the encoders in a turn, as LeRobot counts.
@@ -39,7 +44,8 @@ def read(path: Path, keys: Mapping[str, Any]) -> Table:
 
     Args:
         path: of the data set.
-        keys: `episodes`, how many or which; `joints`, `units` as in `chosen_joints`; `calibration`, the arm's file.
+        keys: `episodes`, how many or which; `joints`, `units` as in `chosen_joints`; `calibration`, the arm's file;
+            `effort`, `velocity`, the unit of these, which are left out where it is not said.
 
     Raises:
         InputError: something is missing or damaged, or the unit is in doubt.
@@ -50,12 +56,34 @@ def read(path: Path, keys: Mapping[str, Any]) -> Table:
         # Under other names, in one order.
         moved = there
     joints, notes = chosen_joints(there, moved, keys, path)
-    columns, said = _frames(path, keys.get("episodes", _EPISODES), [len(there), len(moved)])
+    widths = {_STATE: len(there), _ACTION: len(moved), _TIME: 0, _EPISODE: 0}
+    kinds, left = _beside(info, keys, path)
+    columns, said = _frames(path, keys.get("episodes", _EPISODES), widths | dict.fromkeys(kinds, len(there)))
     state, action = (columns[key][:, places] for key, places in ((_STATE, joints.state), (_ACTION, joints.command)))
     units, factors, why = _units(joints, state, keys, path)
+    beside = {word: (unit, columns[key][:, joints.state]) for key, (word, unit) in kinds.items()}
+    said += [*notes, *why, *left]
     return motion_table(
-        path, joints, units, columns[_TIME], action * factors, state * factors, columns[_EPISODE], [*said, *notes, *why]
+        path, joints, units, columns[_TIME], action * factors, state * factors, columns[_EPISODE], said, beside
     )
+
+
+def _beside(
+    info: Mapping[str, Any], keys: Mapping[str, Any], path: Path
+) -> tuple[dict[str, tuple[str, str]], list[str]]:
+    """Our name and unit of each further feature that is read; and a sentence on each that is not."""
+    found, left = {}, []
+    for key, units in _BESIDE.items():
+        feature, unit = f"observation.{key}", keys.get(key)
+        there = feature in info["features"]
+        if unit is None:
+            left += [f"{feature} left out; motion_keys={{{key}: UNIT}} reads it ({', '.join(units)})"] if there else []
+        elif not there or str(unit) not in units:
+            why = f"write one of {', '.join(units)}, not {visible(str(unit))}" if there else f"{path} has no {feature}"
+            raise InputError(f"motion_keys: {key}: {why}")
+        else:
+            found[feature] = (units[str(unit)], str(unit))
+    return found, left
 
 
 def _info(path: Path) -> Mapping[str, Any]:
@@ -79,8 +107,9 @@ def _names(info: Mapping[str, Any], key: str, path: Path) -> list[str]:
     shape, names = (feature.get("shape"), feature.get("names")) if isinstance(feature, dict) else (None, None)
     if isinstance(names, dict):
         # By group, or each with its place.
-        lists = [own for own in names.values() if isinstance(own, list)]
-        names = [name for own in lists for name in own] if lists else list(names)
+        names = [own for own in names.values() if isinstance(own, list)] or list(names)
+    if isinstance(names, list) and all(isinstance(own, list) for own in names):
+        names = [name for own in names for name in own]
     if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
         raise InputError(
             f"{path}: meta/info.json has no feature '{key}' with one number for each joint; a diagnosis needs the "
@@ -91,8 +120,8 @@ def _names(info: Mapping[str, Any], key: str, path: Path) -> list[str]:
     return [visible(str(name), 40).removesuffix(".pos") for name in names]
 
 
-def _frames(path: Path, wanted: Any, widths: Sequence[int]) -> tuple[dict[str, Array], list[str]]:
-    """State, action, time and episode of the frames of some episodes, and what was left out."""
+def _frames(path: Path, wanted: Any, widths: Mapping[str, int]) -> tuple[dict[str, Array], list[str]]:
+    """Features of the frames of some episodes, and what was left out; widths: numbers of each, 0 of a plain column."""
     try:
         import pyarrow as pa
         from pyarrow import compute, parquet
@@ -114,11 +143,11 @@ def _frames(path: Path, wanted: Any, widths: Sequence[int]) -> tuple[dict[str, A
         if not every:
             raise InputError(f"{path}: has no frame; record at least one episode")
         kept = _kept(every, wanted, path)
-        parts: dict[str, list[Array]] = {key: [] for key in (_STATE, _ACTION, _TIME, _EPISODE)}
+        parts: dict[str, list[Array]] = {key: [] for key in widths}
         for file in (file for file, own in there.items() if kept & set(own)):
-            _check_size(parquet.ParquetFile(file), file)
+            _check_size(parquet.ParquetFile(file), file, widths)
             table = parquet.read_table(file, columns=list(parts), filters=[(_EPISODE, "in", kept)])
-            for key, width in zip(parts, (*widths, 0, 0), strict=True):
+            for key, width in widths.items():
                 column = table[key].combine_chunks()
                 if width and set(compute.list_value_length(column).unique().to_pylist()) != {width}:
                     raise InputError(f"{file}: '{key}' has not {width} numbers in each row, as meta/info.json says")
@@ -133,13 +162,13 @@ def _frames(path: Path, wanted: Any, widths: Sequence[int]) -> tuple[dict[str, A
     return {key: np.concatenate(own) for key, own in parts.items()}, [many] if left else []
 
 
-def _check_size(file: Any, where: Path) -> None:
+def _check_size(file: Any, where: Path, names: Mapping[str, int]) -> None:
     """Refuse a file whose columns unfold to more numbers than a machine records."""
     about = file.metadata
     for group in range(about.num_row_groups):
         for k in range(about.num_columns):
             column = about.row_group(group).column(k)
-            if column.path_in_schema.partition(".list")[0] in (_STATE, _ACTION) and column.num_values > _MOST:
+            if column.path_in_schema.partition(".list")[0] in names and column.num_values > _MOST:
                 raise InputError(
                     f"{where}: has {column.num_values:,} numbers in one column; more than {_MOST:,} are not read"
                 )
