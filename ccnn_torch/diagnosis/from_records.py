@@ -249,8 +249,9 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
     if down.shape != (3,):
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
     arm = inside(mechanism)
-    if isinstance(arm, SerialArm) and parameters is not None and "base" in arm.unknown_frames:
-        # Where the measuring device stands says nothing about gravity; frames by group of rows share the first one's.
+    fitted = isinstance(arm, SerialArm) and "base" in arm.unknown_frames
+    if parameters is not None and fitted and not has_upright_base(mechanism):
+        # Where the measuring device stands says nothing about gravity.
         down = rotation_vector_to_matrix(parameters.reshape(-1, parameters.shape[-1])[0, 3:6]) @ down
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
     _refuse_no_sign(records, covariates)

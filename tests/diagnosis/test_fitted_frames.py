@@ -13,7 +13,9 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
 from ccnn_torch.diagnosis.from_records import named_machine, situation_of
+from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.diagnosis.page.outputs import write_corrected
+from ccnn_torch.diagnosis.residual.linearisation import remainder
 from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, pose_residual, reached
@@ -74,7 +76,7 @@ def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_th
         assert float(far.square().mean().sqrt()) < 1.1 * NOISE * 3**0.5, name
 
 
-def _in_sockets() -> tuple[Situation, Tensor]:
+def _in_sockets(size: float = 1e-3) -> tuple[Situation, Tensor]:
     """Rows of an arm with errors of its geometry whose tool is in one of two sockets of a plate, set up three times."""
     keys = load_mechanism(str(DATA / "ur10.yaml")).recipe["keys"]
     more = {"orientation": "none", "unknown_frames": ["base", "tool"], "frame_per": ["placement"]}
@@ -88,7 +90,7 @@ def _in_sockets() -> tuple[Situation, Tensor]:
     target = places[placement] + (turns[placement] @ pose[..., None])[..., 0]
     truth = arm.nominal.clone()
     truth[:6], truth[-6:-3] = 0.0, torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
-    truth[6:-6] += 1e-3 * torch.randn(len(truth) - 12, generator=g, dtype=torch.float64)
+    truth[6:-6] += size * torch.randn(len(truth) - 12, generator=g, dtype=torch.float64)
     middle = torch.tensor([0.0, -1.2, 1.5, -1.0, 1.0, 0.0], dtype=torch.float64)
     joints = middle + 0.7 * torch.randn(90, 6, generator=g, dtype=torch.float64)
     for _ in range(60):
@@ -106,6 +108,16 @@ def sockets() -> tuple[Situation, Diagnosis]:
     """Rows in sockets and what is found in them."""
     situation, pose = _in_sockets()
     return situation, diagnose_rows(situation, pose)
+
+
+def test_an_arm_far_from_its_table_is_found_though_two_points_hardly_show_its_base() -> None:
+    """A whole Gauss-Newton step turns plates and links so far that no linear model holds."""
+    situation, pose = _in_sockets(1e-2)
+    situation = on_fitted_frames(situation)
+    every = torch.ones(len(pose), dtype=torch.bool)
+    fitted = fit_jointly(situation, pose, [], every, loose_parameters(situation.mechanism, True))
+    left = remainder(situation, pose, [], fitted.parameters).square().sum(-1).mean().sqrt()
+    assert float(left) < 2.5e-4
 
 
 def test_an_arm_stands_upright_however_its_plates_stand(sockets: tuple[Situation, Diagnosis]) -> None:
