@@ -15,8 +15,7 @@ from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import Identification, identify as _identify
 from ccnn_torch.motion import MotionDiagnosis
 from ccnn_torch.motion.job import diagnosed
-from ccnn_torch.report.results.since import SinceResults
-from ccnn_torch.report.results.verify import VerifyResults
+from ccnn_torch.report.results.verify import SinceResults, VerifyResults
 from ccnn_torch.study.sweep import Row, load_sweep, run_sweep
 from ccnn_torch.verification.job import verify_model
 from ccnn_torch.verification.since import what_changed
@@ -128,7 +127,7 @@ def verify(
         InputError: the model or the rows cannot be used; the sentence says what to change.
     """
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
-    return verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code).results
+    return verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code=allow_code).results
 
 
 def since(

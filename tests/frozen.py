@@ -25,9 +25,8 @@ from ccnn_torch.report.results.base import Result
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
 from ccnn_torch.report.results.identified import IdentifiedResults
 from ccnn_torch.report.results.run import RunResults
-from ccnn_torch.report.results.since import SinceResults
 from ccnn_torch.report.results.suite import SuiteResults
-from ccnn_torch.report.results.verify import VerifyResults
+from ccnn_torch.report.results.verify import SinceResults, VerifyResults
 
 FOLDER = Path(__file__).parent / "contracts"
 MODELS: dict[str, type[BaseModel]] = {

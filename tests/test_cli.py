@@ -50,7 +50,7 @@ def refused(outcome: tuple[int, str, str], *words: str) -> None:
 def test_help_has_examples_and_names_every_command(cli: Cli) -> None:
     code, out, _ = cli("--help")
     assert code == 0
-    for command in ("run", "compensate", "picture", "keys"):
+    for command in ("run", "compensate", "keys"):
         assert command in out
         code, text, _ = cli(command, "--help")
         assert code == 0
@@ -105,7 +105,6 @@ def test_missing_words_and_files_are_said_in_one_sentence(cli: Cli, tmp_path: Pa
     refused(cli("run", EXPERIMENTS / "tripod.yaml", "--resume", tmp_path), "--resume")
     refused(cli("run", EXPERIMENTS / "records.yaml", "records=none.csv", "mechanism=tripod"), "none.csv")
     refused(cli("run", EXPERIMENTS / "records.yaml", "records=none.csv", "mechanism=tripd"), "tripd", "tripod")
-    refused(cli("picture", tmp_path, tmp_path / "a.png"), "arrays.safetensors")
 
 
 def test_bad_records_are_refused_by_file_row_and_column(cli: Cli, tmp_path: Path) -> None:

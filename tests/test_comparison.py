@@ -13,7 +13,6 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_run import short
 
-from ccnn_torch.calibration.figures import progress_plot
 from ccnn_torch.calibration.job import RUN
 from ccnn_torch.calibration.page import long_table, result_tables, run_page
 from ccnn_torch.calibration.statistics import reach_block
@@ -64,16 +63,12 @@ def test_every_methods_folder_has_the_same_tags_for_what_is_compared(run: Path) 
         for tag in ("heldout/mse_all", "error/train", "training/evaluations", "training/seconds"):
             assert tag in tags, (method, tag)
         curve = np.median(history["heldout_mse_all"], axis=1)
-        by_evaluations = events.Scalars("by_evaluations/heldout_mse_all")
-        assert [s.step for s in by_evaluations] == list(np.median(history["evaluations"], axis=1))
-        assert [s.value for s in by_evaluations] == pytest.approx(list(curve), rel=1e-6)
-        milliseconds = 1000 * history["seconds"].sum(axis=1)
-        by_time = events.Scalars("by_time/heldout_mse_all")
-        assert [s.step for s in by_time] == [round(v) for v in milliseconds]
-        elapsed = [s.wall_time - by_time[0].wall_time for s in by_time]
-        assert elapsed == pytest.approx(list((milliseconds - milliseconds[0]) / 1000), abs=1e-3)
+        held = events.Scalars("heldout/mse_all")
+        assert [s.value for s in held] == pytest.approx(list(curve), rel=1e-6)
+        seconds = history["seconds"].sum(axis=1)
+        assert [s.wall_time - held[0].wall_time for s in held] == pytest.approx(list(seconds - seconds[0]), abs=1e-3)
     constant = EventAccumulator(str(run / "tensorboard" / "constant")).Reload().Tags()["scalars"]
-    assert {"heldout/mse_all", "by_time/heldout_mse_all", "training/seconds"} <= set(constant)
+    assert {"heldout/mse_all", "training/seconds"} <= set(constant)
 
 
 def test_results_hold_the_schema_and_tell_the_effort(run: Path, results: RunResults) -> None:
@@ -96,9 +91,7 @@ def test_results_hold_the_schema_and_tell_the_effort(run: Path, results: RunResu
         assert block["pose"]["position"]["unit"] == "m" and block["pose"]["rotation"]["rms"]["median"] > 0
     best = results["best_method"]
     assert results["methods"][best]["pose"]["position"]["rms"] == results["pose"]["position"]["after"]["rms"]
-    assert (run / "plots" / "progress.svg").is_file()
     assert "Effort to reach the same held-out error" in (run / "results.md").read_text()
-    assert '<figure id="progress">' in (run / "report.html").read_text()
 
 
 def history(errors: list[float], seconds: float, evaluations: float | None) -> dict[str, np.ndarray]:
@@ -135,16 +128,6 @@ def test_the_effort_of_made_up_curves_as_a_table(results: RunResults) -> None:
     table = next(t for t in result_tables(results.model_copy(update={"reach": made})) if t.title.startswith("Effort"))
     assert tuple(table.rows) == (("ccnn", "2", "0.500", "20"), ("Line", "2", "4.00", "–"), ("constant", *["never"] * 3))
     assert "4.000 m² or less, the lowest that Line reaches" in table.note
-
-
-def test_what_is_plotted_needs_two_methods() -> None:
-    curves = {"a": history([3, 2], 1, 10), "b": history([2, 1], 2, None)}
-    plot = progress_plot(curves, floor=0.5, constant=2.5, unit="m")
-    assert plot is not None and len(plot.figure.axes) == 2
-    time, evaluations = plot.figure.axes
-    assert len(time.lines) == 6 and len(evaluations.lines) == 4
-    assert time.get_xscale() == time.get_yscale() == "log"
-    assert progress_plot({"a": history([3], 1, 1)}) is None
 
 
 @pytest.mark.parametrize("width", [80, 110])

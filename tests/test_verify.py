@@ -99,7 +99,7 @@ def test_a_promise_is_kept_on_rows_of_the_same_machine(model: Path, tmp_path: Pa
     assert found["joints"]["q1"]["before"] == pytest.approx(2e-3, rel=0.05)
     assert found["joints"]["q1"]["after"] < 2e-4
     page = (tmp_path / "v" / "verify.html").read_text()
-    assert found["text"] in page and page.count("<svg") == 4 and "<script" not in page
+    assert found["text"] in page and page.count("<svg") == 2 and "<script" not in page
     assert "The promise is kept" in out
     assert plain(ccnn_torch.verify(model, tmp_path / "new.csv").position) == position
 

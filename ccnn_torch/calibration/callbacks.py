@@ -27,7 +27,6 @@ from ccnn_torch.report.screen import progress_bar
 from ccnn_torch.training import Scaling
 
 _PER_SUBPOPULATION = ("density", "diversity")
-_CURVES = ("heldout_mse_", "error_")
 _CELL = 16
 """Pixels a connection gets in the picture of a mask."""
 
@@ -39,14 +38,11 @@ class TensorBoardCallback:
     `density/subpopulation_1`) and, when there are several repeats, that of the first one under `repeat_0/…`: a median
     curve hides how a single run moves, thirty curves hide everything.
 
-    Errors (`heldout_mse_…` and `error_…`) are written twice more, so that methods whose steps are different things can
-    be compared on one axis: `by_evaluations/NAME` with the evaluations so far in place of the step, and `by_time/NAME`
-    with the milliseconds inside the learner (all repeats together). Every event carries the time inside the learner as
-    its wall time, so that TensorBoard's relative axis means the same.
+    Every event carries the time inside the learner as its wall time, so that TensorBoard's relative axis compares
+    methods whose steps are different things.
 
     The writer opens at the first step it is given and purges what was written at or after that step, so that a run
-    resumed from a checkpoint shows no step twice. That takes points of the other two axes along, whose numbers are not
-    steps; they are written again from `past`.
+    resumed from a checkpoint shows no step twice.
     """
 
     def __init__(
@@ -55,7 +51,6 @@ class TensorBoardCallback:
         *,
         every: int = 1,
         masks_every: int = 20,
-        past: Callable[[], tuple[Mapping[str, Tensor], Tensor]] | None = None,
         tell: Callable[[str], None] = lambda sentence: None,
     ) -> None:
         """Make the callback.
@@ -64,15 +59,12 @@ class TensorBoardCallback:
             folder: where the event files go.
             every: write scalars each so many steps.
             masks_every: write the masks each so many steps.
-            past: gives the history before a resumed training, metrics `t x r [x k]`, and the seconds inside the
-                learner after each step, `t`.
             tell: is given the sentence when the curves cannot be written any further.
         """
         self._folder = Path(folder)
         self._masks: Callable[[], Sequence[ArrayLike]] | None = None
         self._every = every
         self._masks_every = masks_every
-        self._past = past
         self._tell, self._told = tell, False
         self._writer: EventFile | None = None
 
@@ -80,9 +72,6 @@ class TensorBoardCallback:
         """Take the learner's masks where it has some; the writer waits for the first step."""
         genome = getattr(learner, "genome", None)
         self._origin = time.time()
-        if step == 0:
-            # A fresh start has no earlier steps, whatever an older file holds.
-            self._past = None
         if genome is not None:
             self._masks = lambda: [mask.cpu().numpy() for mask in genome(0)[0]]
 
@@ -95,13 +84,11 @@ class TensorBoardCallback:
         if self._writer is None:
             self._writer = EventFile(self._folder, purge_step=step)
             self._origin -= _seconds(metrics) or 0.0
-            self._repeat_past(step)
         seconds = _seconds(metrics)
         if step % self._every == 0 or step == 1:
             for name, value in metrics.items():
                 for tag, number in tags_of(name, value).items():
                     self._writer.add_scalar(tag, number, step, walltime=self._walltime(seconds))
-            self._write_axes(metrics, seconds)
         if self._masks is not None and (step % self._masks_every == 0 or step == 1):
             for layer, mask in enumerate(self._masks(), start=1):
                 picture = np.kron(np.asarray(mask, dtype=np.uint8), np.ones((_CELL, _CELL), dtype=np.uint8)) * 255
@@ -117,45 +104,11 @@ class TensorBoardCallback:
         """As if nothing but the learner took time; None = now."""
         return None if seconds is None else self._origin + seconds
 
-    def _write_axes(self, metrics: Mapping[str, Tensor], seconds: float | None, least: int = 0) -> None:
-        """Errors against evaluations and against time; only points from `least` on."""
-        assert self._writer is not None
-        axes = {} if seconds is None else {"by_time": round(1000 * seconds)}
-        if "evaluations" in metrics:
-            axes["by_evaluations"] = round(_median(metrics["evaluations"]))
-        for name, value in metrics.items():
-            if not name.startswith(_CURVES):
-                continue
-            error = _median(value)
-            for axis, place in axes.items():
-                if place >= least and math.isfinite(error):
-                    self._writer.add_scalar(f"{axis}/{name}", error, place, walltime=self._walltime(seconds))
-
-    def _repeat_past(self, step: int) -> None:
-        """Write again what opening the writer has purged of the other axes: points at or beyond that step's number."""
-        if self._past is None:
-            return
-        history, clock = self._past()
-        for i, seconds in enumerate(clock.tolist()[: step - 1]):
-            if (i + 1) % self._every == 0 or i == 0:
-                self._write_axes({name: values[i] for name, values in history.items()}, seconds, step)
-
     def on_end(self) -> None:
         """Write out and close."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-
-
-def _median(value: Tensor | float) -> float:
-    """Over the repeats that are finite; NaN where none is."""
-    # In plain numbers: a call of torch or numpy takes longer than the median of a few repeats.
-    finite = [number for number in _numbers(value).flatten().tolist() if math.isfinite(number)]
-    return statistics.median(finite) if finite else math.nan
-
-
-def _numbers(value: Tensor | float) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64).detach().cpu()
 
 
 def _seconds(metrics: Mapping[str, Tensor]) -> float | None:
@@ -173,7 +126,7 @@ def tags_of(name: str, value: Tensor | float) -> dict[str, float]:
         name: the metric's name.
         value: `r`, `r x k`, or a single number.
     """
-    numbers = _numbers(value)
+    numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
     group, _, rest = name.partition("_")
     repeats = numbers.shape[0] if numbers.dim() else 1
     table = numbers.reshape(repeats, -1)
@@ -184,8 +137,10 @@ def tags_of(name: str, value: Tensor | float) -> dict[str, float]:
             tag = f"{group}/{rest}_{part}" if rest else f"{group}/{part}"
         else:
             tag = f"{group}/{rest}" if rest else f"training/{name}"
-        if math.isfinite(median := _median(table[:, k])):
-            tags[tag] = median
+        # In plain numbers: a call of torch or numpy takes longer than the median of a few repeats.
+        finite = [number for number in table[:, k].tolist() if math.isfinite(number)]
+        if finite:
+            tags[tag] = statistics.median(finite)
         if repeats > 1 and math.isfinite(first := float(table[0, k])):
             tags[f"repeat_0/{tag}"] = first
     return tags

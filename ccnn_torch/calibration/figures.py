@@ -14,9 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ccnn_torch.calibration.page import run_page, write_tables
-from ccnn_torch.calibration.statistics import CURVE
 from ccnn_torch.display import count_text
-from ccnn_torch.errors import InputError
 from ccnn_torch.evolution.network import alive_nodes as path_nodes
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
 from ccnn_torch.report.figures import (
@@ -27,9 +25,7 @@ from ccnn_torch.report.figures import (
     bare,
     inline_figures,
     joint_error_plot,
-    overview_plot,
     pose_error_plot,
-    save_figure,
     styled,
     workspace_plot,
 )
@@ -91,37 +87,6 @@ def convergence_plot(
     return Plot(f"convergence_{method}", figure, f"Progress of {method} over {len(step)} recorded steps{band}.")
 
 
-@styled
-def population_plot(history: Mapping[str, Array], method: str) -> Plot | None:
-    """Connection density and diversity of each subpopulation against the generation.
-
-    Args:
-        history: `step`: `t`, `density` and `diversity`: `t x r x k`.
-
-    Returns:
-        None when the history has neither.
-    """
-    names = [name for name in ("density", "diversity") if name in history]
-    if not names:
-        return None
-    texts = {"density": "share of connections [1]", "diversity": "diversity [1]"}
-    figure = Figure(figsize=(4.5 * len(names) + (1.5 if len(names) == 1 else 0), 3.3), layout="constrained")
-    for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
-        values = history[name]
-        for i in range(values.shape[2]):
-            _draw_band(axes, history["step"], values[..., i], SERIES[i % len(SERIES)], f"subpopulation {i + 1}")
-        axes.set(title=name.capitalize(), xlabel="generation", ylabel=texts[name])
-        axes.set_ylim(bottom=0)
-        axes.legend(loc="best")
-    layers, repeats = history[names[0]].shape[2], history[names[0]].shape[1]
-    return Plot(
-        f"population_{method}",
-        figure,
-        f"{' and '.join(names).capitalize()} of the {layers} subpopulations of {method} (one for each layer of "
-        f"connections, the first next to the inputs), over {count_text(repeats, 'repeat')}.",
-    )
-
-
 def _held_out(history: Mapping[str, Array]) -> list[str]:
     if "heldout_mse_all" in history:
         return ["heldout_mse_all"]
@@ -138,66 +103,6 @@ def _draw_band(axes: Axes, step: Array, values: Array, colour: str, label: str) 
 
 def _square(unit: str) -> str:
     return "1" if unit == "1" else f"{unit}²"
-
-
-_AXES = (
-    ("seconds", "time inside the learner [s]"),
-    ("evaluations", "evaluations [1]"),
-)
-
-
-@styled
-def progress_plot(
-    histories: Mapping[str, Mapping[str, Array]],
-    *,
-    floor: float | None = None,
-    constant: float | None = None,
-    unit: str = "1",
-) -> Plot | None:
-    """Held-out error of every method against what it cost.
-
-    Args:
-        histories: training curves by method: `heldout_mse_all` [unit²], `seconds` and, where counted, `evaluations`,
-            each `t x r`.
-        floor, constant: mse of the noise floor and of the constant predictor over all joints [unit²].
-        unit: the joints' SI unit.
-
-    Returns:
-        None where fewer than two methods have such curves.
-    """
-    shown = {name: found for name, found in histories.items() if CURVE in found and "seconds" in found}
-    panels = [entry for entry in _AXES if any(entry[0] in found for found in shown.values())]
-    if len(shown) < 2:
-        return None
-    figure = Figure(figsize=(4.8 * len(panels), 3.9), layout="constrained")
-    for axes, (axis, label) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        for i, (name, found) in enumerate(shown.items()):
-            if axis in found:
-                _draw(axes, found[axis], found[CURVE], SERIES[i % len(SERIES)], name)
-        for value, style, text in ((constant, ":", "constant correction"), (floor, "--", "noise floor")):
-            if value is not None and value > 0:
-                axes.axhline(value, color=FLOOR, linestyle=style, linewidth=1.6, label=text)
-        axes.set(xscale="log", yscale="log", xlabel=label)
-    first = figure.axes[0]
-    first.set_ylabel(f"held-out mse [{'1' if unit == '1' else f'{unit}²'}]")
-    handles, labels = first.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 8))
-    repeats = next(iter(shown.values()))[CURVE].shape[1]
-    return Plot(
-        "progress",
-        figure,
-        "Error on held-out rows against what it cost, in the fit on all training rows: time (one repeat's share) and "
-        "passes of the training rows through one model. Dots are the last steps. "
-        f"Medians over {count_text(repeats, 'repeat')}.",
-    )
-
-
-def _draw(axes: Axes, cost: Array, error: Array, colour: str, label: str) -> None:
-    """cost, error: `t x r`."""
-    x, y = np.nanmedian(cost, axis=1), np.nanmedian(error, axis=1)
-    there = (x > 0) & (y > 0)
-    axes.plot(x[there], y[there], color=colour, label=label)
-    axes.plot(x[there][-1:], y[there][-1:], "o", color=colour, markersize=5)
 
 
 Mask = NDArray[np.bool_]
@@ -319,27 +224,6 @@ def run_plots(folder: str | Path, results: RunResults) -> list[Plot]:
     paths = {method: folder / f"history-{method}.safetensors" for method in results.methods}
     histories = {method: load_history(path) for method, path in paths.items() if path.is_file()}
     unit = results.joints[0].unit
-    plots.append(progress_plot(histories, unit=unit, **lines))
     for method, history in histories.items():
         plots.append(convergence_plot(history, method, unit=unit, **lines))
-        plots.append(population_plot(history, method))
     return [plot for plot in plots if plot is not None]
-
-
-def make_picture(folder: str | Path, path: str | Path, joint: str | None = None) -> str:
-    """Draw the one wide picture of a run: joint error and workspace, before and after.
-
-    Args:
-        path: where to write; `.png` and `.svg` are both written.
-        joint: name of the joint shown; by default the one with the largest error.
-
-    Returns:
-        The caption.
-    """
-    arrays = load_arrays(folder)
-    names = [j.name for j in arrays.joints]
-    if joint is not None and joint not in names:
-        raise InputError(f"There is no joint {joint!r}; this run has {', '.join(names)}.")
-    plot = overview_plot(arrays, None if joint is None else names.index(joint))
-    save_figure(plot.figure, path)
-    return plot.caption

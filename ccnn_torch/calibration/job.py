@@ -37,7 +37,7 @@ from ccnn_torch.report.results.run import ModelFiles, RmsMax, RunResults
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, resume_hint
 from ccnn_torch.run_folder.resume import FolderJob, check_fingerprint, fingerprint
-from ccnn_torch.training import Callback, Scaling, Training, past_of
+from ccnn_torch.training import Callback, Scaling, Training
 
 
 def _check(config: RunConfig) -> None:
@@ -111,9 +111,8 @@ def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet:
         label = f"{method}: {choosing if phase == 'choose' else 'training'}"
         board = folder.tensorboard / (method if phase == "fit" else f"{method}-{phase}")
         every = config.training.log_every
-        past = partial(past_of, folder.checkpoint(method, phase))
         shown: list[Callback] = [
-            TensorBoardCallback(board, every=every, past=past, tell=partial(note, quiet=quiet)),
+            TensorBoardCallback(board, every=every, tell=partial(note, quiet=quiet)),
             ProgressBar(label, quiet),
         ]
         if phase == "choose":

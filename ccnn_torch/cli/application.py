@@ -13,7 +13,7 @@ import typer
 from ccnn_torch.cli.from_records import check, diagnose, identify, new, run
 from ccnn_torch.cli.start import start
 from ccnn_torch.cli.studies import blind_check, compare, keys, plan, simulate, suite, sweep
-from ccnn_torch.cli.with_model import compensate, export, picture, report, sign, verify
+from ccnn_torch.cli.with_model import compensate, export, report, sign, verify
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError, MethodFailedError, out_of_memory
 from ccnn_torch.run_folder.folder import Stopped
@@ -62,7 +62,6 @@ for _command in (
     check,
     blind_check,
     report,
-    picture,
     sign,
     keys,
 ):

@@ -288,8 +288,8 @@ def _diagnose_since(model: Path, wanted: DiagnoseConfig, details: bool, quiet: b
         from ccnn_torch.diagnosis.config import folder_of
         from ccnn_torch.report.screen import say, say_place, stdout
         from ccnn_torch.report.table import print_table
+        from ccnn_torch.verification.page import since_tables, write_since
         from ccnn_torch.verification.since import what_changed
-        from ccnn_torch.verification.since_page import since_tables, write_since
 
     if wanted.records is None or wanted.motion:
         raise InputError("--since MODEL: needs new rows of poses; give NEW.csv, or --records NEW.csv")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -71,14 +72,14 @@ def start(
     asks = not yes and not quiet and sys.stdin is not None and sys.stdin.isatty()
     config, diagnosis, folder = out / "robot.yaml", out / "diagnosis", out / "run"
 
+    say: Callable[[str], None] = (lambda text: None) if quiet else typer.echo
+
     def due(step: int, result: Path, what: str, wanted: bool = True) -> bool:
         """Whether a step is still to be done; leaves the command where the user, or a gate, does not want it."""
         if result.is_file():
-            if not quiet:
-                typer.echo(f"{step} of {_STEPS}: done before, {result}")
+            say(f"{step} of {_STEPS}: done before, {result}")
             return False
-        if not quiet:
-            typer.echo(f"{step} of {_STEPS}: {what}")
+        say(f"{step} of {_STEPS}: {what}")
         if not (typer.confirm("Go on?", default=wanted) if asks else yes or wanted):
             typer.echo(f"Stopped here; ccnn start --out {out} goes on{'' if asks else ', with --yes'}.")
             raise typer.Exit
@@ -106,9 +107,7 @@ def start(
     if new_rows is None and asks:
         new_rows = typer.prompt("File of rows measured since, which judge the model (empty: later)", default="") or None
     if new_rows is None:
-        if not quiet:
-            typer.echo(f"5 of {_STEPS}: measure 20 poses or more again, then: ccnn start --out {out} --new NEW.csv")
+        say(f"5 of {_STEPS}: measure 20 poses or more again, then: ccnn start --out {out} --new NEW.csv")
         return
-    if not quiet:
-        typer.echo(f"5 of {_STEPS}: judge the model on {new_rows} (ccnn verify)")
+    say(f"5 of {_STEPS}: judge the model on {new_rows} (ccnn verify)")
     verify(folder / "model.safetensors", out / "verified", new_rows, quiet=quiet)

@@ -36,7 +36,7 @@ def suite(
     """Run a list of cases and compare the methods over all of them; each case is a run folder of its own.
 
     A second call keeps the finished cases and resumes the others. The folder then also holds
-    suite.json, suite.csv, suite.md and a picture: per case the error of each method as a multiple of the noise floor,
+    suite.json, suite.csv and suite.md: per case the error of each method as a multiple of the noise floor,
     the best method, and whether the others are tied with it.
 
     Examples:

@@ -1,4 +1,4 @@
-"""Commands on the file of a model: compensate, export, verify, sign; and on a folder: report, picture."""
+"""Commands on the file of a model: compensate, export, verify, sign; and on a folder: report."""
 
 from __future__ import annotations
 
@@ -125,6 +125,7 @@ def compensate(
             raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
     with if_stopped(NOTHING_WRITTEN):
         from ccnn_torch.compensation.job import compensate_table, is_of_motion
+        from ccnn_torch.compensation.model_files.load import load_compensation
 
         refused = ""
         if is_of_motion(model):
@@ -139,12 +140,13 @@ def compensate(
             frames = [
                 None if text is None else _numbers(text, f"--{o}") for o, text in (("tool", tool), ("base", base))
             ]
+            loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
             if program:
                 from ccnn_torch.compensation.programs.job import compensate_program
 
-                said, refused = compensate_program(model, input, output, public_key, allow_code, *frames)
+                said, refused = compensate_program(loaded, input, output, allow_code, *frames)
             else:
-                said, refused = compensate_table(model, input, output, pose, back, sd, public_key, allow_code, *frames)
+                said, refused = compensate_table(loaded, input, output, pose, back, sd, allow_code, *frames)
     if not quiet:
         from ccnn_torch.report.screen import say
 
@@ -238,9 +240,10 @@ def export(
     ccnn export runs/printer/identified.yaml --to klipper --current printer.cfg --out firmware
     """
     with if_stopped(NOTHING_WRITTEN):
-        from ccnn_torch.compensation.targets.export import export_told
+        from ccnn_torch.compensation.targets.export import export_model
 
-        files, left = export_told(model, to, out, dtype, sd, public_key, allow_code, current)
+        told: list[str] = []
+        files = export_model(model, to, out, dtype, sd, public_key, allow_code, current, told.append)
     if not quiet:
         proven = (
             "; their operations give the model's numbers"
@@ -250,10 +253,10 @@ def export(
         typer.echo(f"{out}: {', '.join(files)} written{proven}.")
         if to == "c99":
             typer.echo(f"Compile them and compare golden vectors: make -C {out} test")
-        if left:
+        if told:
             from ccnn_torch.report.screen import say
 
-            say(left)
+            say(*told)
             typer.echo(f"How to load them: {out / 'README.md'}")
 
 
@@ -303,8 +306,9 @@ def verify(
         if wanted.records is None:
             raise InputError("records: are missing; give RECORDS.csv, --records, or the key in a config")
         loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
-        read = {"columns": wanted.columns, "joint_map": wanted.joint_map, "mechanism_keys": wanted.mechanism_keys}
-        found = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, allow_code, **read)
+        how = {name: getattr(wanted, name) for name in ("columns", "joint_map", "mechanism_keys")}
+        how["allow_code"] = allow_code
+        found = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, **how)
         write_verify_report(out, found.results, found.arrays)
     results = found.results
     if not quiet:
@@ -376,23 +380,3 @@ def report(
         webbrowser.open(page.resolve().as_uri())
     if not quiet:
         typer.echo(page)
-
-
-def picture(
-    run_dir: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
-    out: Annotated[Path, typer.Argument(help="Where to write; a .png and a .svg are made.")],
-    joint: Annotated[str | None, typer.Option(help="Joint to show; by default the one with the largest error.")] = None,
-    quiet: Quiet = False,
-) -> None:
-    """Draw a joint's error and the pose error over the workspace, before and after compensation.
-
-    Example:
-
-    ccnn picture runs/tripod docs/picture.png --joint q3
-    """
-    from ccnn_torch.calibration.figures import make_picture
-    from ccnn_torch.report.screen import say
-
-    caption = make_picture(run_dir, out, joint)
-    if not quiet:
-        say(caption)

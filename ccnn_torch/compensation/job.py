@@ -13,16 +13,15 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ccnn_torch.compensation.model_files.load import LoadedModel, load_compensation
+from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.routines import DAMPED
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError
 from ccnn_torch.files.read import parse_json, read_text
-from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
+from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms.branches import EXACT, ROUNDED, arrives, follow
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
-from ccnn_torch.plugins import code_refused
 from ccnn_torch.records.commanded import commanded_poses, is_commanded
 from ccnn_torch.records.headers import columns_there, pose_columns, read_pose, stack_columns
 from ccnn_torch.records.joint_map import JointMap, read_joint_map
@@ -69,8 +68,7 @@ class WantedPoses:
         Raises:
             InputError: `tool` or `base` of a machine that is no arm with orientation.
         """
-        with code_refused(f"{loaded.path}: its mechanism", allow_code):
-            self._mechanism = mechanism_from_description(loaded.facts["mechanism"], allow_code=True)
+        self._mechanism = loaded.mechanism(allow_code)
         self._same = tool is None and base is None
         machine = self._mechanism
         if not (self._same or (isinstance(machine, SerialArm) and len(machine.pose) == 6)):
@@ -78,10 +76,13 @@ class WantedPoses:
                 f"{'--tool' if base is None else '--base'}: {loaded.path} was made for {machine.name}; only an arm "
                 "whose orientation was measured takes another tool or workpiece frame; leave it out"
             )
-        self._before_pose = torch.eye(4, dtype=torch.float64) if base is None else _frame(base)
-        self._behind_pose = torch.eye(4, dtype=torch.float64)
+        self._before_pose = self._behind_pose = torch.eye(4, dtype=torch.float64)
+        if base is not None:
+            self._before_pose = frames_of(torch.tensor([*base], dtype=torch.float64))
         if tool is not None:
-            self._behind_pose = torch.linalg.inv(_frame(tool)) @ _frame(_measured_tool(loaded, self._mechanism))
+            measured = (machine if loaded.machine is None else loaded.machine.identified).nominal[-6:]
+            wanted = torch.tensor([*tool], dtype=torch.float64)
+            self._behind_pose = torch.linalg.inv(frames_of(wanted)) @ frames_of(measured)
         self._first, self._region = torch.from_numpy(loaded.middle), torch.from_numpy(loaded.region)
         self._before: Tensor | None = None
         self.chooses, self.goals = False, goals
@@ -170,28 +171,15 @@ class WantedPoses:
         """Poses of the tool and in the frame with which the model was made, `s x p`."""
         if self._same:
             return poses
-        found = self._before_pose @ _frames(poses) @ self._behind_pose
+        found = self._before_pose @ frames_of(poses) @ self._behind_pose
         return torch.cat([found[:, :3, 3], matrix_to_rotation_vector(found[:, :3, :3])], -1)
 
 
-def _measured_tool(loaded: LoadedModel, mechanism: Mechanism) -> Sequence[float]:
-    """The tool's frame with which the model was made, x, y, z and rotation vector from the end of the last link."""
-    machine = mechanism if loaded.machine is None else loaded.machine.identified
-    tool: list[float] = machine.nominal[-6:].tolist()
-    return tool
-
-
-def _frame(numbers: Sequence[float]) -> Tensor:
-    """`4 x 4` of x, y, z and a rotation vector [m, rad]."""
-    values = torch.tensor(list(numbers), dtype=torch.float64)
-    return _frames(values[None])[0]
-
-
-def _frames(poses: Tensor) -> Tensor:
-    """`s x 4 x 4` of poses `s x 6`."""
-    found = torch.eye(4, dtype=torch.float64).repeat(len(poses), 1, 1)
-    found[:, :3, :3] = rotation_vector_to_matrix(poses[:, 3:])
-    found[:, :3, 3] = poses[:, :3]
+def frames_of(poses: Tensor) -> Tensor:
+    """`... x 4 x 4` of x, y, z and rotation vectors `... x 6` [m, rad]."""
+    found = torch.eye(4, dtype=torch.float64).repeat(*poses.shape[:-1], 1, 1)
+    found[..., :3, :3] = rotation_vector_to_matrix(poses[..., 3:])
+    found[..., :3, 3] = poses[..., :3]
     return found
 
 
@@ -241,13 +229,12 @@ def is_of_motion(path: Path) -> bool:
 
 
 def compensate_table(
-    model: Path,
+    loaded: LoadedModel,
     input: Path,
     output: Path,
     pose: bool = False,
     back: bool = False,
     sd: bool = False,
-    public_key: Path | None = None,
     allow_code: bool = False,
     tool: Sequence[float] | None = None,
     base: Sequence[float] | None = None,
@@ -255,11 +242,10 @@ def compensate_table(
     """Write the input's columns with commands, deviations and flags; see `ccnn compensate --help` for the columns.
 
     Args:
-        model: a model file or identified.yaml.
+        loaded: as `load_compensation` gives it.
         input, output: CSV files (`input` also .xlsx).
         pose, back, sd: as the options of `ccnn compensate`.
-        public_key, allow_code: as of `load_model`.
-        tool, base: as of `WantedPoses`.
+        allow_code, tool, base: as of `WantedPoses`.
 
     Returns:
         Sentences on what was written; and one on rows in which the model violates the limits in its card, else empty.
@@ -267,12 +253,11 @@ def compensate_table(
     Raises:
         InputError: a file cannot be read or is not in this form; nothing is written then.
     """
-    loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     poses = WantedPoses(loaded, allow_code, tool, base) if pose else None
     found = write_compensated(loaded, input, output, poses, back, sd, allow_code=allow_code)
     said = sentences(output, found, loaded)
     refused = (
-        f"{output}: in {found.fallback} of {found.rows} rows, the first from {found.first} of {input}, {model} "
+        f"{output}: in {found.fallback} of {found.rows} rows, the first from {found.first} of {input}, {loaded.path} "
         "violates the limits in its card (finite numbers, |deviation| within the limit); they were written without any "
         "correction and with inside_domain = 0: do not use this model"
     )

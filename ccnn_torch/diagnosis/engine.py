@@ -21,8 +21,7 @@ from ccnn_torch.diagnosis.residual.noise_evidence import Noise, noise_of_repeats
 from ccnn_torch.diagnosis.residual.rows import copies_of, picked
 from ccnn_torch.diagnosis.result import Diagnosis, content_of, order_block, verdict_block
 from ccnn_torch.diagnosis.search.analysis import Analysis, analyse
-from ccnn_torch.diagnosis.shrink.by_block import by_block
-from ccnn_torch.diagnosis.verdict.blocks import Blocks, blocks
+from ccnn_torch.diagnosis.verdict.blocks import Blocks, blocks, by_block
 from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge_rows, without_names
 from ccnn_torch.diagnosis.verdict.localisation import localise
 from ccnn_torch.diagnosis.verdict.text import lacking_text, shared_text, unseen_text

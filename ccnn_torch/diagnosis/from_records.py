@@ -8,9 +8,11 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import Condition
 from ccnn_torch.diagnosis.checks.mistakes import what_is_wrong
 from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
@@ -25,10 +27,9 @@ from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fit
 from ccnn_torch.diagnosis.mount import SET_ANEW, frames_taken, mount_notes
 from ccnn_torch.diagnosis.residual.distance import size_of
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, noise_of_columns
-from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, used_covariates
-from ccnn_torch.effects.by_group import ByGroup
+from ccnn_torch.effects.apply import ByGroup
 from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.effects.found_machine import found_block
@@ -52,6 +53,75 @@ from ccnn_torch.records import Records, load_records
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES
 from ccnn_torch.records.load import FILE, is_frame
 from ccnn_torch.records.read_table import Frame
+from ccnn_torch.units import LARGEST, parse_header, si_unit_of
+
+
+def simulator_inputs(
+    records: Records, mechanism: Mechanism, covariates: Mapping[str, Tensor]
+) -> tuple[Mechanism, dict[str, Tensor]]:
+    """What the nominal machine takes from the records beyond the covariates that every diagnosis uses.
+
+    Args:
+        records: with all their columns.
+        mechanism: the nominal one.
+        covariates: by name, `s` each, those that are known already.
+
+    Returns:
+        The mechanism with what is constant in all rows (no driver of anything, but no less true), and further
+        covariates that vary, `s` each [SI].
+
+    Raises:
+        InputError: a column that it takes has an empty cell or another unit.
+    """
+    constant: dict[str, Tensor] = {}
+    varying: dict[str, Tensor] = {}
+    for condition in mechanism.takes:
+        if condition.name in covariates or condition.name not in records.columns:
+            continue
+        values = torch.from_numpy(_column(records, condition))
+        if float(values.max() - values.min()) > 0:
+            varying[condition.name] = values
+        else:
+            constant[condition.name] = values[0]
+    return mechanism.under(constant), varying
+
+
+def refuse_lost_rows(records: Records, situation: Situation) -> None:
+    """A simulator answers for every row that was measured; other machines may have rows out of reach, set aside later.
+
+    Raises:
+        InputError: it returns NaN for some; names the first of them and how many there are.
+    """
+    machine = situation.machine.mechanism if isinstance(situation.machine, Framed) else situation.machine
+    if not isinstance(machine, BlackBox):
+        return
+    lost = np.flatnonzero(~torch.isfinite(situation.pose).all(-1).numpy())
+    if len(lost) == 0:
+        return
+    row = int(lost[0])
+    rest = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
+    raise InputError(
+        f"{records.path}: simulator '{machine.name}' returns NaN at {records.name_rows([row])}{rest}, with "
+        f"{machine.words(situation.joints[row], row)}; let it return a pose there, check the units, or remove the row"
+        f"{'s' if len(lost) > 1 else ''}"
+    )
+
+
+def _column(records: Records, condition: Condition) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    values, unit = records.columns[condition.name], records.units[condition.name]
+    where = f"{records.path}: column '{condition.name}'"
+    if not unit:
+        parse_header(condition.name, records.path, condition.unit)
+    if si_unit_of(unit, where) != si_unit_of(condition.unit):
+        raise InputError(f"{where} is in '{unit}', and the simulator takes it in {condition.unit}")
+    empty = np.flatnonzero(~np.isfinite(values))
+    if len(empty):
+        raise InputError(f"{where} is empty at {records.name_rows(empty[:1])}, and the simulator takes it; fill it in")
+    far = np.flatnonzero(np.abs(values) > LARGEST)
+    if len(far):
+        raise InputError(f"{where} has {values[far[0]]:g} at {records.name_rows(far[:1])}, which is nothing measured")
+    return np.array(values, dtype=np.float64).reshape(-1)
+
 
 # Names that a note lists.
 _FEW_NAMES = 6

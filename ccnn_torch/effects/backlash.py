@@ -13,7 +13,7 @@ from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.mechanisms.frames.giving import GIVE
+from ccnn_torch.mechanisms.frames.set_ups import GIVE
 
 _SCALE = {"m": 1.5e-4, "rad": 2e-4}
 # Pushes at which a joint leaves its flank, in units of the usual one; and how soft the change is.

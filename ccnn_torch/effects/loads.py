@@ -13,7 +13,7 @@ from ccnn_torch.effects.columns import by_joint, inside, own_parameters
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm, sees_directions
-from ccnn_torch.mechanisms.frames.giving import GIVE
+from ccnn_torch.mechanisms.frames.set_ups import GIVE
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 

@@ -15,12 +15,11 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects.backlash import Backlash, Friction
-from ccnn_torch.effects.constant import Frame, Geometry, Instrument, Tool, parameter_causes
+from ccnn_torch.effects.constant import Flexure, Frame, Geometry, Instrument, Tool, parameter_causes
 from ccnn_torch.effects.joints import Coupling, JointGain, JointOffset, Transmission
 from ccnn_torch.effects.loads import Compliance, Gravity, Sag
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects.situation import Situation
-from ccnn_torch.effects.sky import Flexure
 from ccnn_torch.effects.time import Drift, FrameDrift, Homing, Latency, Thermal
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, sees_directions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ccnn_torch.effects.by_group import BY
+from ccnn_torch.effects.apply import BY
 from ccnn_torch.effects.constant import PARAMETER
 from ccnn_torch.effects.registry import OUTLIER
 

@@ -1,9 +1,7 @@
 """Geometric parameters of a machine from measured records."""
 
 from ccnn_torch.identification.identifiability import (
-    Bootstrap as Bootstrap,
     Knowledge as Knowledge,
-    bootstrap as bootstrap,
     require_identifiable as require_identifiable,
     what_is_known as what_is_known,
 )

@@ -133,7 +133,6 @@ class SimulateConfig(Section):
     counts: list[int] = Field(
         default=[], description="numbers of measured poses for which the study is repeated (measurements needed)"
     )
-    map: int = Field(default=0, ge=0, description="points across a map of the pose error over the workspace; 0 = none")
 
 
 class IdentifyConfig(JobConfig):
@@ -204,7 +203,6 @@ class IdentifyConfig(JobConfig):
     settings: dict[str, dict[str, Any]] = Field(
         default={}, description="settings of a method, e.g. {hga: {generations: 500}}"
     )
-    bootstrap: int = Field(default=0, ge=0, description="resampled fits beside the formula's intervals; 0 = none")
     refit: bool = Field(
         default=True,
         description="fit again to all rows of the records when held-out rows have judged the first fit: the values and "
@@ -272,7 +270,6 @@ class IdentifyConfig(JobConfig):
             ),
             "joint_noise": (self.joint_noise is not None, "has one noise, that of the whole; remove the key"),
             "transfer": (self.transfer is not None, "has no measured poses to transfer to; remove the key"),
-            "bootstrap": (self.bootstrap > 0, "has the formula's intervals alone; remove the key"),
             "split.kind": (self.split.kind == "block", "measures no positions to sort by; write random or group"),
             "constraint.plate_tolerance": (
                 constraint.kind != "sockets" and constraint.plate_tolerance is not None,

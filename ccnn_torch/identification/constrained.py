@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
@@ -114,9 +113,6 @@ class _Source:
     known: Tensor
     group: Mapping[str, int]
 
-    def problem(self, choice: ParameterChoice, start: Tensor) -> Problem:
-        return self.build(choice, start, self.sizes)
-
     @property
     def sizes(self) -> float | dict[str, float]:
         """As `forward_problem` takes them."""
@@ -132,10 +128,11 @@ class _Source:
         square, count = (each[used].double().sum(0) @ inside for each in (square, seen))
         return (self.noise * (square / count.clamp_min(1)).sqrt()).clamp_min(_LEAST_NOISE)
 
-    def told(self, problem: Problem, values: Tensor) -> dict[str, float]:
-        """What it leaves and the noise, of the first group [SI]."""
-        left = self.left(problem, problem.start), self.left(problem, values)
-        return {"noise": float(self.noise[0]), "before": float(left[0][0]), "after": float(left[1][0])}
+    def told(self, problem: Problem, values: Tensor) -> dict[str, Any]:
+        """How many rows, and of the first group the noise and what is left [SI]."""
+        about = {"rows": len(self.rows.joints), "unit": self.rows.unit}
+        before, after = (float(self.left(problem, at)[0]) for at in (problem.start, values))
+        return about | {"noise": float(self.noise[0]), "before": before, "after": after}
 
     def sd(self, problem: Problem) -> Tensor:
         """Noise of each of the problem's channels, `c` [SI]."""
@@ -143,8 +140,7 @@ class _Source:
         if seen is None or isinstance(sizes, dict):
             each = [sizes[c.name] if isinstance(sizes, dict) else sizes for c in problem.channels]
             return torch.tensor(each, dtype=torch.float64)
-        every = dict(zip((c.name for c in seen.pose), sizes_of_pose(sizes, seen.pose, "noise").tolist(), strict=True))
-        return torch.tensor([every[c.name] for c in problem.channels], dtype=torch.float64)
+        return _of_channels(problem, seen, sizes_of_pose(sizes, seen.pose, "noise"))
 
 
 def fit_constraint(
@@ -176,31 +172,34 @@ def fit_constraint(
     choice = ParameterChoice(of_machine, (), about.tied, {**_priors(config, mechanism, of_machine), **about.prior})
     before = _tool_first(mechanism, rows, build, tool, choice)
     solver = solver_of("lm", config)
-    given = [(config.noise, "noise")]
-    given += [(one.noise, f"constraint.beside.{i}.noise") for i, one in enumerate(config.constraint.beside)]
-    every = [(build, rows), *others]
-    sources = [_source(make, own, noise, key) for (make, own), (noise, key) in zip(every, given, strict=True)]
+    sources = [_source(build, rows, config.noise, "noise")]
+    for i, (about_one, other) in enumerate(zip(config.constraint.beside, others, strict=True)):
+        sources.append(_source(*other, about_one.noise, f"constraint.beside.{i}.noise"))
     rounds = 1 if all(bool(s.known.all()) for s in sources) else _ROUNDS
     selection = select_parameters(mechanism.geometry, choice, before.geometry)
     shared = len(selection.parameters)
     loss = config.robust or "squared"
+
+    def posed() -> tuple[list[Problem], Problem]:
+        """The problems of all rows under the noise as it is known by now, and the one of all of them."""
+        parts = [s.build(choice, before.geometry, s.sizes) for s in sources]
+        return parts, joined(parts, shared)
+
     for done in range(rounds):
-        parts = [s.problem(choice, before.geometry) for s in sources]
-        fit = solver(_all_of(parts, shared), config.seed)
+        parts, whole = posed()
+        fit = solver(whole, config.seed)
         values = _values_of(parts, fit.values, shared)
         for source, part, own in zip(sources, parts, values, strict=True):
             source.noise = torch.where(source.known, source.noise, source.left(part, own))
         if progress is not None:
             progress((done + 1) / rounds)
     if rounds > 1:
-        parts = [s.problem(choice, before.geometry) for s in sources]
-        whole = _all_of(parts, shared)
+        parts, whole = posed()
         spared = float(what_is_known(reweighted(whole, fit.values, loss), fit.values).noise)
         for source in sources:
             more = max(1.0, spared) if spared < float("inf") else 1.0
             source.noise = torch.where(source.known, source.noise, source.noise * more)
-        parts = [s.problem(choice, before.geometry) for s in sources]
-    whole = _all_of(parts, shared)
+        parts, whole = posed()
     after = State(selection.full(fit.values[:, :shared])[0], parts[0], values[0], sources[0].sd(parts[0]))
     known = what_is_known(reweighted(whole, fit.values, loss), fit.values)
     beside = [s.told(p, own) for s, p, own in zip(sources[1:], parts[1:], values[1:], strict=True)]
@@ -217,17 +216,19 @@ def _source(build: Build, rows: ConstraintRows, noise: Any, key: str) -> _Source
         # What is given by name is of that alone.
         numbers = [n if math.isnan(v) else len(read) + k for k, (n, v) in enumerate(zip(numbers, values, strict=True))]
     elif noise is not None:
-        unit = "rad" if _angles_alone(rows) else "m"
-        values = torch.full_like(values, size(noise, unit, key))
+        values = torch.full_like(values, size(noise, rows.unit, key))
         values = sizes_of_pose(noise, read, key) if len({*numbers}) > 1 else values
-    if bool((values <= 0).any()):
-        least = float(values[values <= 0][0])
-        raise InputError(f"{key}: {least:g} is no standard deviation; write a size above 0, or remove the key")
+    _require_sizes(values[~values.isnan()].tolist(), key, "remove the key")
     every = sorted({*numbers}) or [0]
     first = [numbers.index(n) if numbers else 0 for n in every]
     group = {c.name: every.index(n) for c, n in zip(read, numbers, strict=True)} if len(every) > 1 else {}
     known = ~values[first].isnan()
     return _Source(build, rows, torch.where(known, values[first], _FIRST_NOISE), known, group)
+
+
+def _require_sizes(values: Sequence[float], key: str, instead: str) -> None:
+    if not all(v > 0 for v in values):
+        raise InputError(f"{key}: {min(values):g} is no standard deviation; write a size above 0, or {instead}")
 
 
 def _readings(source: _Source, problem: Problem, values: Tensor) -> dict[str, dict[str, Any]]:
@@ -250,14 +251,10 @@ def _readings(source: _Source, problem: Problem, values: Tensor) -> dict[str, di
     }
 
 
-def _all_of(parts: Sequence[Problem], shared: int) -> Problem:
-    return parts[0] if len(parts) == 1 else joined(parts, shared)
-
-
 def _values_of(parts: Sequence[Problem], values: Tensor, shared: int) -> list[Tensor]:
     """Of the values of all `1 x p` those of each part."""
-    ends = list(accumulate((len(p.parameters) - shared for p in parts), initial=shared))
-    return [torch.cat([values[:, :shared], values[:, a:b]], -1) for a, b in pairwise(ends)]
+    own = torch.split(values[:, shared:], [len(p.parameters) - shared for p in parts], -1)
+    return [torch.cat([values[:, :shared], each], -1) for each in own]
 
 
 def _held_error(mechanism: Mechanism, rows: ConstraintRows, state: State, held: Tensor) -> PoseError:
@@ -279,10 +276,6 @@ def _held_error(mechanism: Mechanism, rows: ConstraintRows, state: State, held: 
     return PoseError(parts[0], parts[1] if "rad" in units.values() else None)
 
 
-def _angles_alone(rows: ConstraintRows) -> bool:
-    return rows.seen is not None and all(c.unit == "rad" for c in rows.seen.pose[: rows.seen.compared])
-
-
 def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
     if about.kind == "sockets":
         several = len(torch.unique(rows.said, dim=0)) > 1
@@ -293,9 +286,8 @@ def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
         def sockets(choice: ParameterChoice, start: Tensor, noise: Any) -> Problem:
             # Without noise there is nothing to weigh the plate's scale against.
             scale = 0.0 if noise is None else plate
-            return socket_problem(
-                mechanism, rows.joints, rows.group, rows.said, noise, rows.weights, choice, start, scale
-            )
+            of = rows.joints, rows.group, rows.said
+            return socket_problem(mechanism, *of, noise, rows.weights, choice, start, scale)
 
         return sockets
 
@@ -350,10 +342,7 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
         values = sizes_by_name(given or {}, links, key, usual).tolist()
     else:
         values = [size(given, None, key)] * len(links)
-    if any(not v > 0 for v in values):
-        raise InputError(
-            f"{key}: {min(values):g} is no standard deviation; write a size above 0, or fix the parameters"
-        )
+    _require_sizes(values, key, "fix the parameters")
     priors = {p.name: v for p, v in zip(links, values, strict=True)}
     return priors | {n: _TOOL_TOLERANCE for n in free if n.startswith("tool_") and "tool" not in unknown}
 
@@ -378,12 +367,14 @@ def _sizes(rows: ConstraintRows, problem: Problem, noise: float | None) -> Tenso
     seen = rows.seen
     if seen is None:
         return torch.full((len(problem.channels),), 1.0 if noise is None else noise, dtype=torch.float64)
-    if noise is None:
-        sizes = torch.tensor([1 / ROTATION_WEIGHT if c.unit == "rad" else 1.0 for c in seen.pose], dtype=torch.float64)
-    else:
-        sizes = sizes_of_pose(noise, seen.pose, "noise")
-    every = dict(zip((c.name for c in seen.pose), sizes.tolist(), strict=True))
-    return torch.tensor([every[c.name] for c in problem.channels], dtype=torch.float64)
+    plain = torch.tensor([1 / ROTATION_WEIGHT if c.unit == "rad" else 1.0 for c in seen.pose], dtype=torch.float64)
+    return _of_channels(problem, seen, plain if noise is None else sizes_of_pose(noise, seen.pose, "noise"))
+
+
+def _of_channels(problem: Problem, seen: Mechanism, sizes: Tensor) -> Tensor:
+    """Of sizes of all that is read those of the problem's channels, `c`."""
+    names = [c.name for c in seen.pose]
+    return sizes[[names.index(c.name) for c in problem.channels]]
 
 
 def _residual(problem: Problem, values: Tensor) -> Tensor:
@@ -441,8 +432,7 @@ def identify_by_constraint(
     noise = None if config.noise is None or fit.readings else float(fit.after.noise[0])
     found = Found(outcome, _known(fit), before, after)
     results, arrays = assemble(config, measured, fit.selection, {"lm": found}, noise, _only_by_prior(fit, found.known))
-    told = [{"rows": len(own.joints), "unit": "rad" if _angles_alone(own) else "m"} for _, own in others]
-    results["constraint"] = _constraint(config, rows, fit, told)
+    results["constraint"] = _constraint(config, rows, fit)
     if rows.in_sockets and bool(held.any()):
         # Other constraints show less than a place, to which new positions could not be held.
         first, last = (PoseError(error.position[0], None) for error in (before, after))
@@ -490,20 +480,14 @@ def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
     return [f"No better known than by the tolerance given: {', '.join(prior)}."] if prior else []
 
 
-def _constraint(
-    config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit, told: list[dict[str, Any]]
-) -> dict[str, Any]:
+def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit) -> dict[str, Any]:
     """What was found of the constraint itself."""
     assert config.constraint is not None
-    k, knowledge = len(fit.selection.parameters), fit.knowledge
-    unknowns = {}
-    for i, parameter in enumerate(fit.after.problem.parameters[k:], start=k):
-        sd = float(knowledge.sd[0, i])
-        unknowns[parameter.name] = {
-            "value": float(fit.after.values[0, i]),
-            "sd": sd if math.isfinite(sd) else None,
-            "unit": parameter.unit,
-        }
+    every = zip(fit.after.problem.parameters, fit.after.values[0].tolist(), fit.knowledge.sd[0].tolist(), strict=False)
+    unknowns = {
+        parameter.name: {"value": value, "sd": sd if math.isfinite(sd) else None, "unit": parameter.unit}
+        for parameter, value, sd in [*every][len(fit.selection.parameters) :]
+    }
     return {
         "kind": config.constraint.kind,
         "placements": [
@@ -511,12 +495,12 @@ def _constraint(
             for number, label in rows.labels.items()
         ],
         "unknowns": unknowns,
-        "unit": "rad" if _angles_alone(rows) else "m",
+        "unit": rows.unit,
         "noise": float(fit.after.noise[0]),
         "noise_known": config.noise is not None,
         "beside": [
-            {"kind": about.kind, "records": str(about.records), **one, **found}
-            for about, one, found in zip(config.constraint.beside, told, fit.beside, strict=True)
+            {"kind": about.kind, "records": str(about.records), **found}
+            for about, found in zip(config.constraint.beside, fit.beside, strict=True)
         ],
         "readings": fit.readings,
     }

@@ -60,6 +60,12 @@ class ConstraintRows:
         """Whether what is said of a row is its socket's place."""
         return self.seen is None
 
+    @property
+    def unit(self) -> str:
+        """Of an equation: `rad` where only angles were read, else `m`."""
+        read = [] if self.seen is None else self.seen.pose[: self.seen.compared]
+        return "rad" if read and all(c.unit == "rad" for c in read) else "m"
+
     def measured(self, names: Sequence[str]) -> Tensor:
         """Which of these channels were measured in each row, `s x c` bool."""
         if self.seen is None:

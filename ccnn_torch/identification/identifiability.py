@@ -1,8 +1,7 @@
-"""What the rows determine: standard errors, correlations, hidden directions in words, and a bootstrap over rows."""
+"""What the rows determine: standard errors, and hidden directions in words."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.problem import OPEN, Fit, Problem, Solver, WeightedRows
+from ccnn_torch.identification.problems.problem import OPEN, Problem, WeightedRows
 
 # Component of a hidden direction below which a parameter does not take part. Real geometry is never exactly parallel:
 # smaller components come from the errors themselves and would tie everything to everything.
@@ -89,12 +88,11 @@ _RANK = 1e-9
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What rows determine of `r` machines and `k` parameters: standard errors, correlations, open directions.
+    """What rows determine of `r` machines and `k` parameters: standard errors, open directions.
 
     Attributes:
         parameters: the free ones.
         sd: standard errors, `r x k` [SI], priors included; inf where the rows (and priors) leave a parameter open.
-        correlation: of the estimates, `r x k x k` [1]; NaN in the rows and columns of parameters left open.
         identifiable: `r x k`, bool: whether the rows alone determine the parameter, without the priors.
         singular_values: of the Jacobian with residuals in their unit and parameters in plausible errors, falling,
             without priors, `r x k` [1].
@@ -111,7 +109,6 @@ class Knowledge:
 
     parameters: tuple[Parameter, ...]
     sd: Tensor
-    correlation: Tensor
     identifiable: Tensor
     singular_values: Tensor
     directions: Tensor
@@ -141,8 +138,7 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
     of its own; one that is moved by less keeps a finite error, with that movement in it.
 
     Args:
-        problem: for a robust fit, that of `robust.reweighted`; its standard deviations are then approximate; see
-        `bootstrap`.
+        problem: for a robust fit, that of `reweighted`; its standard deviations are then approximate.
         values: `r x k` or `k` [SI].
 
     Raises:
@@ -169,13 +165,10 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
     spread = torch.where(open_, 0.0, 1 / strength.clamp_min(1e-300))[..., None] * basis
     covariance = spread.mT @ spread
     root = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    correlation = covariance / (root[..., None] * root[..., None, :]).clamp_min(1e-300)
-    either = left_open[..., None] | left_open[..., None, :]
     worst = int(seen.sum(-1).argmin())
     return Knowledge(
         parameters=problem.parameters,
         sd=torch.where(left_open, torch.inf, ((unit[:, None] * root).square() + dragged).sqrt() * problem.scale),
-        correlation=torch.where(either, torch.nan, correlation.clamp(-1, 1)),
         identifiable=identifiable,
         singular_values=singular,
         directions=directions,
@@ -220,89 +213,3 @@ def _tall(matrix: Tensor) -> Tensor:
     if missing <= 0:
         return matrix
     return torch.cat([matrix, matrix.new_zeros(*matrix.shape[:-2], missing, matrix.shape[-1])], dim=-2)
-
-
-@dataclass(frozen=True)
-class Bootstrap:
-    """Fits to redrawn rows.
-
-    Attributes:
-        values: `count x r x k` [SI].
-        converged: `count x r`, bool.
-    """
-
-    values: Tensor
-    converged: Tensor
-
-    def sd(self) -> Tensor:
-        """Standard deviation over the draws, `r x k` [SI]."""
-        return self.values.std(0)
-
-    def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
-        """Percentiles over the draws that hold the share `level`, low and high, `r x k` each [SI]."""
-        tails = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=self.values.dtype, device=self.values.device)
-        low, high = torch.quantile(self.values, tails, dim=0)
-        return low, high
-
-
-def bootstrap(problem: Problem, fit: Fit, solver: Solver, count: int = 200, seed: int = 0) -> Bootstrap:
-    """Solve the problem again with redrawn rows, all draws as machines side by side in one call of the solver.
-
-    The residual rows that the fit leaves are drawn with replacement and put to the fitted ones (Efron 1979), raised by
-    sqrt(N / (N - k)) for the parameters fitted; it keeps the poses.
-
-    Args:
-        problem: as it was solved.
-        fit: what the solver found; searches begin there.
-        solver: the one to try.
-        count: draws.
-        seed: of the draws; the solver gets it too.
-
-    Raises:
-        InputError: fewer than two draws.
-    """
-    if count < 2:
-        raise InputError(f"a bootstrap has at least 2 draws; got {count}")
-    generator = torch.Generator().manual_seed(seed)
-    r, s = problem.weights.shape
-    device = problem.start.device
-    uniform = torch.rand(count, r, s, generator=generator, dtype=torch.float64).to(device)
-
-    def repeated(table: Tensor) -> Tensor:
-        """`count * r x …` from `r x …`; what all machines share stays one."""
-        return table if len(table) == 1 else table.repeat(count, *[1] * (table.dim() - 1))
-
-    # The prior pulls to where it pulled before.
-    start = problem.start if bool(torch.isfinite(problem.prior_sd).any()) else fit.values
-    again = dataclasses.replace(
-        problem,
-        start=start.repeat(count, 1),
-        weights=problem.weights.repeat(count, 1),
-        missing=None if problem.missing is None else repeated(problem.missing),
-        data=(*(repeated(d) for d in problem.data), _redrawn(problem, fit.values, uniform)),
-        residual=lambda values, *rows: problem.residual(values, *rows[:-1]) + rows[-1],
-    )
-    found = solver(again, seed)
-    return Bootstrap(found.values.reshape(count, r, -1), found.converged.reshape(count, r))
-
-
-def _redrawn(problem: Problem, values: Tensor, uniform: Tensor) -> Tensor:
-    """What to add to the residual so that at `values` it is one drawn from those left there: `count * r x s x c`."""
-    rows = WeightedRows(dataclasses.replace(problem, weights=(problem.weights > 0).to(values)))
-    everyone = torch.arange(len(values), device=values.device)
-    kept = (problem.weights > 0).any(0)
-    left = values.new_zeros(*problem.weights.shape, len(problem.channels))
-    left[:, kept] = rows.residuals(values[:, None], everyone)[:, 0]
-    root = problem.weights.sqrt()[..., None]
-    # What was not measured is 0 among the residuals that are drawn.
-    drawn_from = (problem.weights > 0).sum(-1) * len(problem.channels)
-    raised = (drawn_from / (problem.equations - values.shape[-1]).clamp_min(1)).sqrt()[:, None, None]
-    pool = left * root
-    pool = (pool - pool.sum(-2, keepdim=True) / (root > 0).sum(-2, keepdim=True)) * raised
-    # The n-th used row of a machine, n drawn uniformly.
-    order = torch.argsort((problem.weights == 0).to(torch.int8), dim=-1, stable=True)
-    number = (uniform * (problem.weights > 0).sum(-1)[:, None]).long()
-    chosen = torch.take_along_dim(order.expand_as(number), number, dim=-1)
-    drawn = torch.take_along_dim(pool.expand(*number.shape, -1), chosen[..., None], dim=-2)
-    offset = torch.where(root > 0, drawn / root.clamp_min(1e-300), 0.0) - left
-    return offset.flatten(0, 1)

@@ -13,16 +13,15 @@ from torch import Tensor
 
 from ccnn_torch.config.split import Given
 from ccnn_torch.display import typed_path
-from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.identification import Fit, Progress
+from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig, base_method
 from ccnn_torch.identification.constrained import identify_by_constraint
-from ccnn_torch.identification.identifiability import bootstrap
-from ccnn_torch.identification.judge import drawn_errors, map_error, read_elsewhere, transferred
+from ccnn_torch.identification.judge import drawn_errors, read_elsewhere, transferred
 from ccnn_torch.identification.measured import Measured, from_records, nominal_machine
 from ccnn_torch.identification.page import identified_page, not_settled, write_identified_csv, write_identified_report
-from ccnn_torch.identification.result import Found, assemble, beside_truth, judged, known_at, promised, residuals_of
+from ccnn_torch.identification.result import Found, assemble, beside_truth, judged, known_at, promised
 from ccnn_torch.identification.simulated import count_study, simulate
 from ccnn_torch.identification.solve import (
     QUICK,
@@ -127,7 +126,7 @@ def identify(
         progress = None if watch is None else watch("lm")
         return Identification(config, *identify_by_constraint(config, progress, given), given=given)
     mechanism, measured = prepare(config, given)
-    plain = config.residual == "auto" and config.methods == ["lm"] and not config.bootstrap
+    plain = config.residual == "auto" and config.methods == ["lm"]
     of_each = isinstance(config.noise, dict) and not isinstance(measured.mechanism, Instrument)
     if isinstance(measured.mechanism, Seen) and plain and not of_each:
         # Parts of poses leave much open: links stay near nominal by priors, as beside any constraint.
@@ -179,25 +178,15 @@ def _judged(
     found = {name: judged(config, measured, selection, name, outcome) for name, outcome in outcomes.items()}
     found = {name: _refitted(config, measured, name, one) for name, one in found.items()}
     outcomes = {name: one.outcome for name, one in found.items()}
-    resampled = _bootstrap(config, measured, outcomes)
-    results, arrays = assemble(config, measured, selection, found, _given_noise(config, measured), (), resampled)
+    results, arrays = assemble(config, measured, selection, found, _given_noise(config, measured))
     arrays |= picture
     results["promise"] = promised(measured, found[first])
-    one = outcomes[first].machines[:1]
-    arrays |= residuals_of(pieces_of(measured, config, is_apart(first, config), one), selection, outcomes[first])
-    arrays["observed"] = measured.rows.observed[:1]
-    arrays |= {f"observed_leg{leg}": rows.observed[:1] for leg, rows in measured.leg_rows.items()}
     if measured.truth is None:
         return results, arrays, outcomes
     arrays["truth"] = measured.truth
     for name, one_found in found.items():
-        block, more = beside_truth(config, measured, selection, name, one_found)
-        results["methods"][name] |= block
-        arrays |= more
+        results["methods"][name] |= beside_truth(config, measured, selection, one_found)
     results["compensation"] = results["methods"][first]["compensation"]
-    error = map_error(measured, measured.start, torch.arange(measured.machines))
-    if measured.map is not None and error is not None:
-        arrays |= {"map": measured.map, "map_before": error}
     return results, arrays, outcomes
 
 
@@ -206,24 +195,6 @@ def _given_noise(config: IdentifyConfig, measured: Measured) -> float | None:
         return None
     lengths = torch.tensor([c.unit == "m" for c in measured.mechanism.pose])
     return float(measured.pose_noise[lengths].square().sum().sqrt())
-
-
-def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: Mapping[str, Outcome]) -> Tensor | None:
-    """Standard deviations of the first machine's parameters over resampled fits, `k` [SI]; None where not asked for."""
-    if config.bootstrap == 0:
-        return None
-    method = config.methods[0]
-    if base_method(method) not in QUICK:
-        raise InputError(f"bootstrap: {method} takes too long to be run again and again; put lm first in methods")
-    selection, outcome = select(measured, config), outcomes[method]
-    one, solver = torch.arange(1), solver_of(method, config)
-    found = selection.free(outcome.values[:1])
-    sd = torch.full_like(found[0], torch.nan)
-    for number, piece in enumerate(pieces_of(measured, config, is_apart(method, config), one)):
-        at = selection.places(piece.parameters)
-        fit = Fit(found[:, at], torch.zeros(1), outcome.converged[:1], 0, "")
-        sd[at] = bootstrap(piece, fit, solver, config.bootstrap, config.seed + number).sd()[0]
-    return sd
 
 
 def _fingerprint(measured: Measured) -> str:

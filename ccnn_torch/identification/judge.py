@@ -176,22 +176,6 @@ def commanded(measured: Measured, values: Tensor, machines: Tensor) -> Commanded
     return Commanded(error(near), error(exact), error(linear))
 
 
-def map_error(measured: Measured, values: Tensor, machines: Tensor) -> Tensor | None:
-    """RMS over the machines of the position error at the points of the map, commanded by a geometry; `m` [m].
-
-    Args:
-        values: `r x K` [SI].
-    """
-    if measured.map is None or measured.truth is None:
-        return None
-    mechanism, place = measured.mechanism, measured.map.expand(len(machines), -1, -1)
-    guess = mechanism.solve_inverse(measured.map).expand(len(machines), -1, -1)
-    joints = measured.kinematics.command(place, values[:, None], guess)
-    reached = measured.kinematics.reached(joints, measured.truth[machines][:, None], place)
-    # At the very edge a machine may not reach what the nominal one does: its NaN is no error of a position.
-    return mechanism.pose_error(reached, place).position.square().nanmean(0).sqrt()
-
-
 # Residuals that chance makes as rarely as this do not fit the noise given; a ratio this near 1 is nothing to speak of.
 _RARE, _NEAR = 1e-3, 1.5
 # Held-out errors above so many times the noise, or this share of the error before, say that something else is wrong.

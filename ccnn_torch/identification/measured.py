@@ -132,7 +132,6 @@ class Measured:
         wanted, wanted_joints: held-out poses that machines are sent to, `r x t x p` [SI], and joints near by,
             `r x t x n` [SI], which select the branch; None for records.
         reached: true poses of the held-out rows, `r x t x p` [SI]; None for records.
-        map: poses of the map, `m x p` [SI]; None where none is drawn.
         pose_noise: standard deviation of each observed coordinate, `o` [SI]; None where it is to be estimated.
         joint_noise: of the recorded joints, `n` [SI]; None where there is none.
         data_hash: SHA-256 of the records; empty for simulated data.
@@ -150,7 +149,6 @@ class Measured:
     wanted: Tensor | None = None
     wanted_joints: Tensor | None = None
     reached: Tensor | None = None
-    map: Tensor | None = None
     pose_noise: Tensor | None = None
     joint_noise: Tensor | None = None
     data_hash: str = ""

@@ -8,14 +8,38 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from ccnn_torch.compensation.targets.machines import klipper_numbers
 from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter, typed_path
 from ccnn_torch.files.write import write_rows
 from ccnn_torch.identification.judge import figure_text
-from ccnn_torch.identification.klipper import printer_table
+from ccnn_torch.records.formats.klipper import STEPPERS
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.page import Answer, InlineFigure, Page, Section, sections_of
 from ccnn_torch.report.table import Table, table_of
+
+
+def printer_table(results: Mapping[str, Any]) -> Table | None:
+    """Sections and keys with what was there and what to write; None for another machine.
+
+    An endstop is told as what to add to it.
+    """
+    if results["mechanism"] != "delta_printer":
+        return None
+    was, now = (
+        klipper_numbers({name: p[when] for name, p in results["parameters"].items()}) for when in ("nominal", "value")
+    )
+    rows = [("[printer]", "delta_radius", f"{1e3 * was[0]:.3f}", f"{1e3 * now[0]:.3f}")]
+    for i, stepper in enumerate(STEPPERS):
+        rows.append((f"[{stepper}]", "arm_length", f"{1e3 * was[1][i]:.3f}", f"{1e3 * now[1][i]:.3f}"))
+        rows.append(("", "angle", f"{was[2][i]:.4f}", f"{now[2][i]:.4f}"))
+        rows.append(("", "position_endstop", "x", f"x {1e3 * (now[3][i] - was[3][i]):+.3f}"))
+    note = (
+        "In mm and degrees; x is the position_endstop that was there. Lean and skew of the rails have no key in "
+        "Klipper: identified.yaml holds them."
+    )
+    return Table("printer.cfg (Klipper)", ("section", "key", "was", "write"), tuple(rows), note, to_type=True)
+
 
 _Z95 = 1.96
 # Values on a screen.
@@ -255,8 +279,6 @@ def _parameter_table(results: Block) -> Table:
     else:
         columns["identified - nominal"] = column(lambda p, scale: number_text((p["value"] - p["nominal"]) / scale, 4))
     columns["standard deviation"] = column(lambda p, scale: figure_text(p, "sd", scale) if p["identifiable"] else lost)
-    if any("sd_bootstrap" in block for block in free.values()):
-        columns["by bootstrap"] = column(lambda p, scale: figure_text(p, "sd_bootstrap", scale))
     several = results["machines"] > 1
     note = f"Solver: {results['method']}." + " Medians over the machines, [5 %, 95 %]." * several
     return table_of("Parameters", columns, f"{note} {_interval_note(results)}", ["nominal"])

@@ -18,7 +18,6 @@ from ccnn_torch.identification.judge import (
     commanded,
     doubts_of,
     figures,
-    map_error,
     noise_of_test,
     predicted,
 )
@@ -43,7 +42,6 @@ class Known:
     Attributes:
         sd: `r x k` [SI]; inf where the rows do not determine the parameter.
         combinations: those that cannot be identified, in words, of the first machine.
-        correlation: `k x k` of the first machine, NaN where nothing is known.
         singular_values: of the scaled Jacobian, by leg or for all, of the first machine.
         noise: standard deviation of the whitened residual, `r` [1].
         freedom: equations to spare, of all pieces, `r` [1].
@@ -51,7 +49,6 @@ class Known:
 
     sd: Tensor
     combinations: list[str]
-    correlation: Tensor
     singular_values: list[list[float]]
     noise: Tensor
     freedom: Tensor
@@ -67,15 +64,12 @@ def known_of(found: Sequence[Knowledge], selection: Selection) -> Known:
     """Put together what is known of pieces; unknowns behind a piece's parameters are not of the machine."""
     k = len(selection.parameters)
     sd = torch.full((len(found[0].sd), k), math.inf, dtype=torch.float64)
-    correlation = torch.full((k, k), math.nan, dtype=torch.float64)
     for knowledge in found:
         at = torch.tensor(selection.places(knowledge.parameters[:k]))
         sd[:, at] = knowledge.sd[:, : len(at)]
-        correlation[at[:, None], at] = knowledge.correlation[0, : len(at), : len(at)]
     return Known(
         sd=sd,
         combinations=[sentence for knowledge in found for sentence in knowledge.combinations],
-        correlation=correlation,
         singular_values=[knowledge.singular_values[0].tolist() for knowledge in found],
         noise=torch.stack([knowledge.noise for knowledge in found]).mean(0),
         freedom=torch.stack([knowledge.freedom for knowledge in found]).sum(0),
@@ -127,7 +121,6 @@ def assemble(
     found: Mapping[str, Found],
     noise: float | None = None,
     notes: Sequence[str] = (),
-    resampled: Tensor | None = None,
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """What `identified.json` has of every identification, and tensors by name for the pictures.
 
@@ -138,7 +131,6 @@ def assemble(
         found: by method, in the config's order.
         noise: of a measured position, where the config names it, all coordinates together [m].
         notes: sentences beside those of the rows and of the methods.
-        resampled: standard deviations of the bootstrap, `k` [SI].
     """
     method, first = next(iter(found.items()))
     blocks = {name: _method_block(measured, one) for name, one in found.items()}
@@ -160,7 +152,7 @@ def assemble(
             "test": measured.test.joints.shape[1],
         },
         "method": method,
-        "parameters": _parameters(measured, selection, first, resampled),
+        "parameters": _parameters(measured, selection, first),
         "combinations_not_identifiable": known.combinations,
         "test": test,
         "methods": blocks,
@@ -178,7 +170,7 @@ def assemble(
             "torch": torch.__version__,
         },
     }
-    arrays = {"start": measured.start, "correlation": known.correlation}
+    arrays = {"start": measured.start}
     arrays |= {f"values_{name}": one.outcome.values for name, one in found.items()}
     errors = {"before": first.before, "after": first.after} | ({} if first.noise is None else {"noise": first.noise})
     for when, error in errors.items():
@@ -235,10 +227,8 @@ def promised(measured: Measured, found: Found) -> dict[str, Any] | None:
     return promise_block(before, after, configurations(measured.test.joints[0], measured.mechanism.joints))
 
 
-def beside_truth(
-    config: IdentifyConfig, measured: Measured, selection: Selection, method: str, found: Found
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """What simulated machines show of a method: entries of its block, and tensors by name."""
+def beside_truth(config: IdentifyConfig, measured: Measured, selection: Selection, found: Found) -> dict[str, Any]:
+    """What simulated machines show of a method: entries of its block."""
     outcome, machines = found.outcome, found.outcome.machines
     assert measured.truth is not None
     truth = measured.truth[machines]
@@ -259,9 +249,7 @@ def beside_truth(
         block["compensation"] = {
             name: before_and_after(sent.before, getattr(sent, name), removed=True) for name in ("exact", "linear")
         }
-    arrays = {f"deviation_{method}": gap, f"bound_{method}": bound}
-    error = map_error(measured, outcome.values, machines)
-    return block, arrays if error is None else arrays | {f"map_{method}": error}
+    return block
 
 
 def _deviations(selection: Selection, gap: Tensor, error: Tensor) -> dict[str, Any]:
@@ -277,7 +265,7 @@ def _deviations(selection: Selection, gap: Tensor, error: Tensor) -> dict[str, A
     return answer
 
 
-def _parameters(measured: Measured, selection: Selection, found: Found, resampled: Tensor | None) -> dict[str, Any]:
+def _parameters(measured: Measured, selection: Selection, found: Found) -> dict[str, Any]:
     """Every parameter of the mechanism; one that is not free has its nominal value and no interval.
 
     A machine on which the method did not converge has no interval either; where it converged on none, nothing is
@@ -310,19 +298,5 @@ def _parameters(measured: Measured, selection: Selection, found: Found, resample
             "word": parameter.word,
             "shown": parameter.shown,
         }
-        if i is not None and resampled is not None:
-            entry["sd_bootstrap"] = float(resampled[i]) if identifiable else None
         answer[name] = entry
     return answer
-
-
-def residuals_of(pieces: list[Problem], selection: Selection, outcome: Outcome) -> dict[str, Tensor]:
-    """Whitened residuals of the first machine at the start and at the result, `s x c` for each piece."""
-    found = selection.free(outcome.values[:1])
-    arrays = {}
-    for number, problem in enumerate(pieces):
-        data = tuple(d[:1] for d in problem.data)
-        after = found[:, selection.places(problem.parameters)]
-        for when, values in (("before", problem.start[:1]), ("after", after)):
-            arrays[f"residual_{when}_{number}"] = problem.residual(values[:, None], *data)[0].detach()
-    return arrays

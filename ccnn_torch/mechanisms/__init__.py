@@ -7,7 +7,6 @@ if TYPE_CHECKING:
     from ccnn_torch.mechanisms.dh_file import read_dh_file as read_dh_file, read_urdf as read_urdf
     from ccnn_torch.mechanisms.frames.fit import fit_frames as fit_frames
     from ccnn_torch.mechanisms.frames.framed import Framed as Framed
-    from ccnn_torch.mechanisms.frames.giving import Giving as Giving
     from ccnn_torch.mechanisms.frames.instrument import Instrument as Instrument, fit_unknown as fit_unknown
     from ccnn_torch.mechanisms.frames.judge import judge_frames as judge_frames
     from ccnn_torch.mechanisms.frames.partial import (
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
         as_measured as as_measured,
         sees_directions as sees_directions,
     )
-    from ccnn_torch.mechanisms.frames.set_ups import SetUps as SetUps, set_ups as set_ups
+    from ccnn_torch.mechanisms.frames.set_ups import Giving as Giving, SetUps as SetUps, set_ups as set_ups
     from ccnn_torch.mechanisms.machines.delta import Delta as Delta, DeltaLinear as DeltaLinear
     from ccnn_torch.mechanisms.machines.five_bar import FiveBar as FiveBar
     from ccnn_torch.mechanisms.machines.overconstrained import Overconstrained2Dof as Overconstrained2Dof

@@ -102,22 +102,21 @@ class Mechanism(nn.Module):
         keys: of a machine of this package, whose name is also its spec.
         """
         super().__init__()
-        if not any(self._defines(verb) for verb in ("closure", "solve_inverse", "forward_kinematics")):
-            raise InputError(
-                f"mechanism '{name}' must define closure(pose, joints, parameters), solve_inverse(pose, …) or "
-                "forward_kinematics(joints, …)"
-            )
+        verbs = ("closure", "solve_inverse", "forward_kinematics")
+        if all(getattr(type(self), verb) is getattr(Mechanism, verb) for verb in verbs):
+            raise InputError(f"mechanism '{name}' must define {', '.join(verbs[:2])} or {verbs[2]}, see Mechanism")
         self.name = name
         self.joints = tuple(joints)
         self.pose = tuple(pose)
         self.geometry = tuple(geometry)
-        self.register_buffer("nominal", _tensor([g.nominal for g in self.geometry]))
-        self.register_buffer("low", _tensor(low))
-        self.register_buffer("high", _tensor(high))
+        self.register_buffer("nominal", torch.tensor([g.nominal for g in self.geometry], dtype=torch.float64))
+        self.register_buffer("low", torch.tensor(low, dtype=torch.float64))
+        self.register_buffer("high", torch.tensor(high, dtype=torch.float64))
         middle = (self.low + self.high) / 2
-        self.register_buffer("home_pose", middle if home_pose is None else _tensor(home_pose))
+        self.register_buffer("home_pose", middle if home_pose is None else middle.new_tensor(home_pose))
         self.register_buffer("home_joints", torch.zeros(len(self.joints), dtype=torch.float64))
-        self.home_joints.copy_(self.solve_inverse(self.home_pose) if home_joints is None else _tensor(home_joints))
+        here = self.solve_inverse(self.home_pose) if home_joints is None else middle.new_tensor(home_joints)
+        self.home_joints.copy_(here)
         self.inverse_kinematics = InverseKinematics(self.solve_inverse)
         # How to build it again: `spec` and `keys` of `load_mechanism`, which fills this in for a user's class.
         own = type(self).__module__.startswith("ccnn_torch.mechanisms.machines.")
@@ -129,10 +128,6 @@ class Mechanism(nn.Module):
             own = vars(cls).get(verb)
             if own is not None and len(inspect.signature(own).parameters) == 3:
                 setattr(cls, verb, _without_guess(own))
-
-    @classmethod
-    def _defines(cls, verb: str) -> bool:
-        return getattr(cls, verb) is not getattr(Mechanism, verb)
 
     # The maths: a mechanism overrides one of these three, and what it has in closed form.
 
@@ -147,7 +142,7 @@ class Mechanism(nn.Module):
         Returns:
             `... x c` [SI].
         """
-        if self._defines("solve_inverse"):
+        if type(self).solve_inverse is not Mechanism.solve_inverse:
             return self.wrap(self.solve_inverse(pose, parameters, joints) - joints)
         gap = self.forward_kinematics(joints, parameters, pose) - pose
         turning = torch.tensor([c.unit == "rad" for c in self.pose], device=gap.device)
@@ -447,13 +442,12 @@ class Mechanism(nn.Module):
         Raises:
             InputError: the class is not defined in a file (an interactive session), so it cannot be built again.
         """
-        names = [g.name for g in self.geometry]
         return {
             "name": self.name,
             **(self.recipe or self._own_file()),
             "joints": [j.header for j in self.joints],
             "pose": [c.header for c in self.pose],
-            "parameters": dict(zip(names, self.nominal.tolist(), strict=True)),
+            "parameters": {g.name: v for g, v in zip(self.geometry, self.nominal.tolist(), strict=True)},
         }
 
     def _own_file(self) -> dict[str, Any]:
@@ -477,7 +471,7 @@ class Mechanism(nn.Module):
         wrong = sorted(set(values) ^ set(names))
         if wrong:
             raise InputError(f"mechanism '{self.name}' has the parameters {', '.join(names)}; check {', '.join(wrong)}")
-        self.nominal.copy_(_tensor([float(values[n]) for n in names]))
+        self.nominal.copy_(self.nominal.new_tensor([float(values[n]) for n in names]))
         self._follow_nominal()
 
 
@@ -502,7 +496,3 @@ def _without_guess(verb: Callable[[Any, Tensor, Tensor | None], Tensor]) -> Call
         return verb(self, given, parameters)
 
     return ignoring
-
-
-def _tensor(values: Sequence[float]) -> Tensor:
-    return torch.tensor([float(v) for v in values], dtype=torch.float64)

@@ -3,7 +3,6 @@
 from ccnn_torch.planning.candidates import Candidates as Candidates, draw_candidates as draw_candidates
 from ccnn_torch.planning.design import (
     Gains as Gains,
-    Observability as Observability,
     observability as observability,
     recommended_count as recommended_count,
 )

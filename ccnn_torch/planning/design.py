@@ -191,30 +191,18 @@ def _choose(design: Design, candidate: int, place: int | None = None) -> None:
 _WINDOW = 3
 
 
-@dataclass(frozen=True)
-class Observability:
-    """Indices of an identification matrix with singular values σ1 ≥ … ≥ σk; each `...`, larger is better.
+def observability(jacobian: Tensor, poses: int | Tensor | None = None) -> Tensor:
+    """O1 of identification matrices with singular values σ1 ≥ … ≥ σk, (σ1 ⋯ σk)^(1/k) / √poses (Borm and Menq 1991).
 
-    They are 0 where a direction is unobservable. The ranking of poses by O1, with any divisor, does not depend on the
-    parameters' units (Sun and Hollerbach 2008).
-
-    Attributes:
-        o1: (σ1 ⋯ σk)^(1/k) / √poses (Borm and Menq 1991).
-        o1_by_parameters: (σ1 ⋯ σk)^(1/k) / k, the divisor of paper 004.
-        o2: σk / σ1, the reciprocal condition number (Driels and Pathre 1990).
-    """
-
-    o1: Tensor
-    o1_by_parameters: Tensor
-    o2: Tensor
-
-
-def observability(jacobian: Tensor, poses: int | Tensor | None = None) -> Observability:
-    """Indices of identification matrices.
+    It is 0 where a direction is unobservable. The ranking of poses by it does not depend on the parameters' units (Sun
+    and Hollerbach 2008), nor on the divisor.
 
     Args:
         jacobian: derivatives of all measured channels by the parameters, `... x m x k`; rows of 0 count for nothing.
         poses: number of poses that the rows come from, an integer or `...`; m when None (one channel a pose).
+
+    Returns:
+        `...`, larger is better.
 
     Raises:
         InputError: no parameter.
@@ -224,11 +212,9 @@ def observability(jacobian: Tensor, poses: int | Tensor | None = None) -> Observ
         raise InputError("observability needs an identification matrix with at least one column")
     if m < k:
         jacobian = torch.cat([jacobian, jacobian.new_zeros(*jacobian.shape[:-2], k - m, k)], dim=-2)
-    values = torch.linalg.svdvals(jacobian)
     count = torch.as_tensor(m if poses is None else poses, dtype=jacobian.dtype)
-    mean = values.log().mean(-1).exp()
-    largest = torch.where(values[..., 0] > 0, values[..., 0], 1.0)
-    return Observability(mean / count.sqrt(), mean / k, values[..., -1] / largest)
+    mean: Tensor = torch.linalg.svdvals(jacobian).log().mean(-1).exp()
+    return mean / count.sqrt()
 
 
 @dataclass(frozen=True)
@@ -237,7 +223,7 @@ class Gains:
 
     Attributes:
         count: number of poses, `t`, int64.
-        observability: of these poses, `t` each; parameters in plausible errors, measurements in noise.
+        o1: `observability` of these poses, `t`; parameters in plausible errors, measurements in noise.
         information: det^(1/2k) of the information, `t`: the mean accuracy of the parameters, growing like √poses where
             a pose only averages the noise.
         sd: standard deviation of each parameter, `t x k` [SI].
@@ -247,7 +233,7 @@ class Gains:
     """
 
     count: Tensor
-    observability: Observability
+    o1: Tensor
     information: Tensor
     sd: Tensor
     largest: Tensor
@@ -279,7 +265,6 @@ def gains_of_sets(matrices: Tensor, count: Tensor, scale: Tensor, prior_sd: Tens
         scale, prior_sd: as `gains_of`.
     """
     k = matrices.shape[-1]
-    seen = observability(matrices, count)
     held = torch.diag(torch.where(torch.isfinite(prior_sd), scale / prior_sd, 0.0)).expand(len(matrices), k, k)
     whole = torch.cat([matrices, held], dim=1)
     # The triangular factor of the rows, and not their square, so that no digits are lost.
@@ -292,7 +277,7 @@ def gains_of_sets(matrices: Tensor, count: Tensor, scale: Tensor, prior_sd: Tens
     nan = torch.full((1,), math.nan, dtype=matrices.dtype)
     return Gains(
         count.expand(len(matrices)),
-        seen,
+        observability(matrices, count),
         information,
         relative * scale,
         largest,

@@ -48,16 +48,12 @@ def gain_table(plan: Plan, short: bool = False) -> Table:
 
     Args:
         plan: one plan.
-        short: about a dozen rows and O1 alone, for a screen.
+        short: about a dozen rows, for a screen.
     """
     gains = plan.choice.gains
     counts = gains.count.tolist()
     step = max(1, len(counts) // 10) if short else 1
     shown = [i for i, n in enumerate(counts) if i % step == 0 or n in (len(plan.pose), plan.choice.recommended)]
-    seen = gains.observability
-    indices = {"O1": seen.o1}
-    if not short:
-        indices |= {"O1 (by k)": seen.o1_by_parameters, "O2": seen.o2}
     rows = []
     for i in shown:
         worst = int((gains.sd[i] / plan.scale).argmax())
@@ -66,7 +62,7 @@ def gain_table(plan: Plan, short: bool = False) -> Table:
         rows.append(
             (
                 str(counts[i]) + ("" if counts[i] <= len(plan.pose) else " (more)"),
-                *(number_text(float(index[i]), 3) for index in indices.values()),
+                number_text(float(gains.o1[i]), 3),
                 _percent(float(gains.information_gain[i])),
                 _percent(float(gains.sd_gain[i])),
                 f"{parameter.name} {number_text(float(gains.sd[i, worst]) / scale, 3)} {unit}",
@@ -74,7 +70,7 @@ def gain_table(plan: Plan, short: bool = False) -> Table:
         )
     return Table(
         "What each further pose gives" + (f", leg {plan.leg}" if plan.leg is not None else ""),
-        ("poses", *indices, "gain of det^(1/2k)", "fall of largest sd", "largest sd"),
+        ("poses", "O1", "gain of det^(1/2k)", "fall of largest sd", "largest sd"),
         tuple(rows),
         "Parameters in plausible errors and measurements in noise; a pose that only averages the noise gains 1/(2n).",
     )

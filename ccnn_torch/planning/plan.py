@@ -103,7 +103,7 @@ class Plan:
     @property
     def o1(self) -> float:
         """O1 of the planned poses, divided by √poses; parameters in plausible errors, measurements in noise."""
-        return float(self.choice.gains.observability.o1[self.choice.gains.count.tolist().index(len(self.pose))])
+        return float(self.choice.gains.o1[self.choice.gains.count.tolist().index(len(self.pose))])
 
 
 def choose_poses(
@@ -170,7 +170,7 @@ def _random(rows: Tensor, count: int, scale: Tensor, prior_sd: Tensor) -> tuple[
     """O1 and standard deviations of poses taken at random, medians."""
     draws = torch.rand(_RANDOM, len(rows), generator=torch.Generator().manual_seed(0)).topk(count, sorted=False).indices
     found = gains_of_sets(rows[draws].flatten(1, 2), torch.tensor(count), scale, prior_sd)
-    return float(found.observability.o1.median()), found.sd.median(0).values
+    return float(found.o1.median()), found.sd.median(0).values
 
 
 def plan_poses(

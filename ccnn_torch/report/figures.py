@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -221,27 +221,38 @@ def draw_joint_error(axes: Axes, arrays: RunArrays, joint: int) -> None:
     axes.margins(x=0.015)
 
 
-@styled
 def pose_error_plot(arrays: RunArrays) -> Plot:
     """Distribution of the held-out pose error before and after, position and (where there is one) orientation."""
-    pairs = arrays.pose_errors
-    figure = Figure(figsize=(4.6 * len(pairs) + (1.2 if len(pairs) == 1 else 0), 3.5), layout="constrained")
-    medians = []
-    for axes, (title, unit, before, after) in zip(figure.subplots(1, len(pairs), squeeze=False)[0], pairs, strict=True):
-        medians.append(_draw_distribution(axes, title, unit, before[arrays.test], after[arrays.test]))
-    return Plot(
-        "pose_error",
-        figure,
-        f"Share of the {count_text(int(arrays.test.sum()), 'held-out row')} whose pose error is at most the value on "
-        f"the axis: {' and '.join(medians)}.",
-    )
+    rows = count_text(int(arrays.test.sum()), "held-out row")
+    errors = [
+        (title, unit, {"before": before[arrays.test], "after": after[arrays.test]})
+        for title, unit, before, after in arrays.pose_errors
+    ]
+    return distribution_plot(errors, f"Share of the {rows} whose pose error is at most the value on the axis")
 
 
-def _draw_distribution(axes: Axes, title: str, si_unit: str, before: Array, after: Array) -> str:
-    scale, unit = display_unit(si_unit, float(np.median(before)))
+_OF_ERRORS = {"before": BEFORE, "after": AFTER, "measurement noise": FLOOR}
+
+
+@styled
+def distribution_plot(errors: Sequence[tuple[str, str, Mapping[str, Array]]], caption: str) -> Plot:
+    """Share of rows whose error is at most so large, a panel for each kind of error.
+
+    Args:
+        errors: title, SI unit, and the errors `s` before and after, and of the measurement noise where it is known.
+        caption: its first words; the medians follow.
+    """
+    figure = Figure(figsize=(4.6 * len(errors) + (1.2 if len(errors) == 1 else 0), 3.5), layout="constrained")
+    panels = figure.subplots(1, len(errors), squeeze=False)[0]
+    medians = [_draw_distribution(axes, *one) for axes, one in zip(panels, errors, strict=True)]
+    return Plot("pose_error", figure, f"{caption}: {' and '.join(medians)}.")
+
+
+def _draw_distribution(axes: Axes, title: str, si_unit: str, errors: Mapping[str, Array]) -> str:
+    scale, unit = display_unit(si_unit, float(np.median(errors["before"])))
     medians = []
-    for values, colour, label in ((before, BEFORE, "before"), (after, AFTER, "after")):
-        shown = np.sort(values) / scale
+    for label, values in errors.items():
+        shown, colour = np.sort(values) / scale, _OF_ERRORS[label]
         median = float(np.median(shown))
         medians.append(median)
         share = np.arange(1, len(shown) + 1) / len(shown) * 100
@@ -250,8 +261,8 @@ def _draw_distribution(axes: Axes, title: str, si_unit: str, before: Array, afte
         axes.annotate(
             number_text(median, 3), (median, 50), xytext=(7, -11), textcoords="offset points", color=colour, fontsize=9
         )
-    least = min(float(v[v > 0].min()) if (v > 0).any() else np.inf for v in (before, after))
-    if np.isfinite(least) and before.max() / least > 10:
+    least = min(float(v[v > 0].min()) if (v > 0).any() else np.inf for v in errors.values())
+    if np.isfinite(least) and errors["before"].max() / least > 10:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_title(title.capitalize())
@@ -276,45 +287,12 @@ def workspace_plot(arrays: RunArrays) -> Plot | None:
         None when the machine moves along one line only.
     """
     place, before, after, where = _map_data(arrays)
-    planes = planes_of(place, arrays.axes)
-    if not planes:
+    if not planes_of(place, arrays.axes):
         return None
-    shapes = [height_of(place, arrays.axes, plane) for plane in planes]
-    figure = Figure(figsize=(9.2, sum(3.6 * shape + 0.85 for shape in shapes)), layout="constrained")
-    grid = figure.subplots(len(planes), 2, squeeze=False, height_ratios=shapes)
-    rms_text = draw_pairs(figure, grid, arrays.axes, planes, place, before, after)
+    figure, rms_text = maps(arrays.axes, place, before, after)
     return Plot(
         "workspace", figure, f"Position error over the workspace {where}, before and after on one scale: {rms_text}."
     )
-
-
-@styled
-def overview_plot(arrays: RunArrays, joint: int | None = None) -> Plot:
-    """One wide picture of a run: a joint's error against the noise floor, and the workspace before and after.
-
-    Args:
-        arrays: of one repeat.
-        joint: which joint; by default the one with the largest error before.
-    """
-    if joint is None:
-        joint = int(np.argmax(np.abs(arrays.measured).max(0)))
-    place, before, after, where = _map_data(arrays)
-    planes = planes_of(place, arrays.axes)[:1]
-    shape = height_of(place, arrays.axes, planes[0]) if planes else 1.0
-    # The maps take the width that their shape needs at this height; the joint's panel takes the rest.
-    wide = float(np.clip(1 / shape, 0.7, 1.4))
-    figure = Figure(figsize=(6.5 + 6.2 * wide if planes else 8.2, 4.0), layout="constrained")
-    grid = figure.subplots(1, 3 if planes else 1, width_ratios=(1.8, wide, wide) if planes else (1,), squeeze=False)
-    left = grid[0, 0]
-    draw_joint_error(left, arrays, joint)
-    left.set_xlabel("row of the records")
-    left.set_title(f"Joint {arrays.joints[joint].name}", pad=26)
-    left.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, handletextpad=0.3, columnspacing=1.2)
-    caption = f"Error of joint {arrays.joints[joint].name} before and after compensation"
-    if planes:
-        rms_text = draw_pairs(figure, grid[:, 1:], arrays.axes, planes, place, before, after)
-        caption += f" (left), and position error over the workspace {where}: {rms_text}"
-    return Plot("overview", figure, caption + ".")
 
 
 def _map_data(arrays: RunArrays) -> tuple[Array, Array, Array, str]:
@@ -332,7 +310,7 @@ def planes_of(place: Array, axes: tuple[Coordinate, ...]) -> list[tuple[int, int
     return [(moving[0], other) for other in moving[1:3]]
 
 
-def height_of(place: Array, axes: tuple[Coordinate, ...], plane: tuple[int, int]) -> float:
+def _height_of(place: Array, axes: tuple[Coordinate, ...], plane: tuple[int, int]) -> float:
     """Height of a map over its width."""
     across, up = plane
     if axes[across].unit != axes[up].unit:
@@ -340,11 +318,8 @@ def height_of(place: Array, axes: tuple[Coordinate, ...], plane: tuple[int, int]
     return float(np.clip(np.ptp(place[:, up]) / np.ptp(place[:, across]), 0.25, 1.6))
 
 
-def draw_pairs(
-    figure: Figure,
-    grid: Any,
+def maps(
     axes: tuple[Coordinate, ...],
-    planes: list[tuple[int, int]],
     place: Array,
     before: Array,
     after: Array,
@@ -352,8 +327,16 @@ def draw_pairs(
     titles: tuple[str, str] = ("Before", "After"),
     quantity: str = "position error",
     si_unit: str = "m",
-) -> str:
-    """Fill a grid of `planes` lines and two columns, add the colour bar; returns the RMS values as text."""
+) -> tuple[Figure, str]:
+    """Values `s` over places `s x d` before and after, a line of two maps for each of `planes_of`, on one scale.
+
+    Returns:
+        the figure, and the RMS values as text.
+    """
+    planes = planes_of(place, axes)
+    shapes = [_height_of(place, axes, plane) for plane in planes]
+    figure = Figure(figsize=(9.2, sum(3.6 * shape + 0.85 for shape in shapes)), layout="constrained")
+    grid = figure.subplots(len(planes), 2, squeeze=False, height_ratios=shapes)
     scale, unit = display_unit(si_unit, float(np.median(before)))
     norm = _norm(before / scale, after / scale)
     drawn: Any = None
@@ -368,7 +351,7 @@ def draw_pairs(
         bar.ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         bar.ax.yaxis.set_minor_locator(NullLocator())
-    return f"RMS {number_text(_rms(before) / scale, 3)} → {number_text(_rms(after) / scale, 3)} {unit}"
+    return figure, f"RMS {number_text(_rms(before) / scale, 3)} → {number_text(_rms(after) / scale, 3)} {unit}"
 
 
 def _norm(before: Array, after: Array) -> Normalize:

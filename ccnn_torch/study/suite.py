@@ -1,4 +1,4 @@
-"""Comparison of methods over the cases of a suite: `suite.json`, `suite.csv`, `suite.md` and a picture.
+"""Comparison of methods over the cases of a suite: `suite.json`, `suite.csv` and `suite.md`.
 
 Everything is about the held-out mean squared error of the joint deviation, over all joints, repeat by repeat:
 
@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from pydantic import BaseModel, ConfigDict, Field
 
 from ccnn_torch.calibration.config import RunConfig
@@ -30,7 +29,6 @@ from ccnn_torch.engine import Engine
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_rows, write_whole
 from ccnn_torch.files.yaml_file import read_yaml
-from ccnn_torch.report.figures import FLOOR, GREY, SERIES, Plot, save_figure, styled
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.page import Page, Section
 from ccnn_torch.report.results.base import Spread, interval_text
@@ -152,12 +150,10 @@ def _summary(cases: list[Case]) -> dict[str, Summary]:
 
 
 def write_suite(folder: Path, comparison: SuiteResults) -> Path:
-    """Write `suite.csv`, `suite.md`, `suite.png`, `suite.svg` and, last, `suite.json`; returns the path of the last."""
+    """Write `suite.csv`, `suite.md` and, last, `suite.json`; returns the path of the last."""
     header = ("case", "method", "quantity", "unit", "median", "low", "high", "values")
     write_rows(folder / "suite.csv", header, _long_table(comparison))
     write_whole(folder / "suite.md", suite_page(comparison).markdown())
-    if comparison.cases:
-        save_figure(suite_plot(comparison).figure, folder / "suite")
     path = folder / "suite.json"
     write_json(path, comparison)
     return path
@@ -346,48 +342,3 @@ def _failures(comparison: SuiteResults) -> list[str]:
     for (method, sentence), cases in where.items():
         texts.append(f"{method} failed in {count_text(len(cases), 'case')} ({', '.join(cases)}): {sentence}")
     return texts
-
-
-# The methods of a row are offset, so that their intervals do not overlap.
-_SPREAD = 0.62
-
-
-@styled
-def suite_plot(comparison: SuiteResults) -> Plot:
-    """Rows = cases, points = methods with their 5 % to 95 % intervals, on a logarithmic axis.
-
-    The axis is the ratio to the noise floor, or to the best method where a case has no known floor.
-    """
-    cases, methods = comparison.cases, list(comparison.methods)
-    floors = all(case.floor is not None for case in cases)
-    key = "ratio_to_floor" if floors else "ratio_to_best"
-    others = [method for method in methods if method != "constant"]
-    colours = {method: SERIES[i % len(SERIES)] for i, method in enumerate(others)} | {"constant": GREY}
-    figure = Figure(figsize=(8.2, 1.5 + 0.36 * len(cases)), layout="constrained")
-    axes = figure.subplots()
-    for i, method in enumerate(methods):
-        offset = _SPREAD * ((i + 0.5) / len(methods) - 0.5)
-        there = [(row, case.methods[method]) for row, case in enumerate(cases) if method in case.methods]
-        known = [(row, block) for row, block in there if block[key].median is not None]
-        if not known:
-            continue
-        at = [row + offset for row, _ in known]
-        middle = [block[key].median for _, block in known]
-        low = [block[key].low for _, block in known]
-        high = [block[key].high for _, block in known]
-        axes.hlines(at, low, high, color=colours[method], linewidth=1.4, alpha=0.7)
-        axes.plot(middle, at, "o", color=colours[method], markersize=4.5, label=method)
-    axes.axvline(1.0, color=FLOOR, linewidth=1.2, linestyle="--", zorder=0.5)
-    axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_yticks(range(len(cases)), [f"{case.name} ({case.split})" for case in cases])
-    axes.set_ylim(len(cases) - 0.4, -0.6)
-    versus = "noise floor" if floors else "best method"
-    axes.set_xlabel(f"held-out mean squared joint error / {versus} [1]")
-    figure.legend(loc="outside upper center", ncols=min(len(methods), 6))
-    return Plot(
-        "suite",
-        figure,
-        f"{count_text(len(cases), 'case')}: held-out mean squared joint error of each method as a multiple of the "
-        f"{versus}, median and 5 % to 95 % interval over the repeats.",
-    )

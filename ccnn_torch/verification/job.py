@@ -27,12 +27,10 @@ from ccnn_torch.mechanisms import (
     SerialArm,
     as_measured,
     load_mechanism,
-    mechanism_from_description,
 )
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, rigid_body_frame
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
-from ccnn_torch.plugins import code_refused
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.commanded import SECOND
@@ -80,8 +78,7 @@ def nominal_mechanism(
     if spec is None:
         if model.machine is not None:
             return model.machine.nominal
-        with code_refused(f"{model.path}: its mechanism", allow_code):
-            return mechanism_from_description(about, allow_code=True)
+        return model.mechanism(allow_code)
     shown = load_mechanism(spec, **(keys or {}))
     given = inside(shown)
     if isinstance(given, SerialArm) and len(about["pose"]) == 3:
@@ -94,6 +91,37 @@ def nominal_mechanism(
             )
     given.set_parameters(about["parameters"])
     return shown.around(given) if isinstance(shown, Seen) else given
+
+
+def new_rows(
+    model: LoadedModel,
+    records: Any,
+    mechanism: str | None,
+    allow_code: bool = False,
+    columns: Mapping[str, str] | None = None,
+    joint_map: Mapping[str, str] | None = None,
+    mechanism_keys: Mapping[str, Any] | None = None,
+) -> tuple[Mechanism, Records]:
+    """Rows measured after a model was made, and the nominal machine as they show it.
+
+    Args:
+        model: as `load_compensation` gives it.
+        records: what `load_records` takes. Headers that the model's records had and its run mapped are mapped alike.
+        mechanism: name or file of the nominal machine; the one that the model describes when None.
+        allow_code: run the Python file that the model names for a user's own mechanism.
+        columns: header in the records -> ``name[unit]`` or ``ignore``; those of the model's run when None or empty.
+        joint_map: joint -> sum of columns; that of the model's run, where the records count so, when None or empty.
+        mechanism_keys: keys of the mechanism's constructor.
+
+    Raises:
+        InputError: the rows lack a column, or are not of this machine.
+    """
+    machine = nominal_mechanism(model, mechanism, allow_code, mechanism_keys)
+    names = [c.name for c in model.covariates]
+    there, counted = mapped_columns(model, records, machine)
+    maps = {"columns": columns or there, "joint_map": joint_map or counted}
+    loaded = load_records(records, machine, names, learns=False, **maps)
+    return as_measured(machine, loaded.pose_coordinates, loaded.path, loaded.pose), loaded
 
 
 def mapped_columns(model: LoadedModel, records: Any, machine: Mechanism) -> tuple[dict[str, str], dict[str, str]]:
@@ -265,10 +293,7 @@ def verify_model(
     mechanism: str | None = None,
     compensated: bool = False,
     refit_frames: bool = False,
-    allow_code: bool = False,
-    columns: Mapping[str, str] | None = None,
-    joint_map: Mapping[str, str] | None = None,
-    mechanism_keys: Mapping[str, Any] | None = None,
+    **how: Any,
 ) -> Verified:
     """Judge a model on new rows.
 
@@ -278,25 +303,14 @@ def verify_model(
     the nominal one: after = its distance from that, before = the pose error without compensation, by the model.
 
     Args:
-        records: what `load_records` takes. Headers that the model's records had and its run mapped are mapped alike.
-        mechanism: name or file; the one that the model describes when None.
+        model, records, mechanism, how: as of `new_rows`.
         refit_frames: a rigid motion of the measuring frame is fitted before rows are judged, to "before" and "after"
             each its own: the tracker was moved since the model was made.
-        allow_code: run the Python file that the model names for a user's own mechanism.
-        columns: header in the records -> ``name[unit]`` or ``ignore``; those of the model's run when None or empty.
-        joint_map: joint -> sum of columns; that of the model's run, where the records count so, when None or empty.
-        mechanism_keys: keys of the mechanism's constructor.
 
     Raises:
-        InputError: the rows lack a column, are not of this machine, or frames cannot be fitted to them.
+        InputError: as `new_rows`, or frames cannot be fitted to the rows.
     """
-    machine = nominal_mechanism(model, mechanism, allow_code, mechanism_keys)
-    names = [c.name for c in model.covariates]
-    there, counted = mapped_columns(model, records, machine)
-    loaded = load_records(
-        records, machine, names, learns=False, columns=columns or there, joint_map=joint_map or counted
-    )
-    machine = as_measured(machine, loaded.pose_coordinates, loaded.path, loaded.pose)
+    machine, loaded = new_rows(model, records, mechanism, **how)
     if not refit_frames:
         check_rows(loaded, machine)
     rows = predict(model, machine, loaded, compensated)

@@ -39,13 +39,12 @@ from ccnn_torch.evidence.beam import search
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet, covariance
 from ccnn_torch.evidence.judge import Explanation, Verdict, judge, marginal, posterior
 from ccnn_torch.evidence.priors import EFFECT
-from ccnn_torch.mechanisms import Instrument, Mechanism, as_measured, sees_directions
+from ccnn_torch.mechanisms import Instrument, Mechanism, sees_directions
 from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.designs import Candidates
-from ccnn_torch.records import load_records
-from ccnn_torch.report.results.since import Change, ChangedNumber, Gap, NextPose, SinceResults, Told
-from ccnn_torch.verification.job import Motion, Rows, fit_motion, mapped_columns, nominal_mechanism, predict
+from ccnn_torch.report.results.verify import Change, ChangedNumber, Gap, NextPose, SinceResults, Told
+from ccnn_torch.verification.job import Motion, Rows, fit_motion, new_rows, predict
 from ccnn_torch.verification.promise import configurations, promise_of
 
 _T = TypeVar("_T")
@@ -109,36 +108,19 @@ class _Rows:
 
 
 def what_changed(
-    model: LoadedModel,
-    records: Any,
-    mechanism: str | None = None,
-    *,
-    allow_code: bool = False,
-    columns: Mapping[str, str] | None = None,
-    joint_map: Mapping[str, str] | None = None,
-    mechanism_keys: Mapping[str, Any] | None = None,
-    seed: int = 0,
+    model: LoadedModel, records: Any, mechanism: str | None = None, *, seed: int = 0, **how: Any
 ) -> tuple[SinceResults, dict[str, Tensor]]:
     """What changed since a model was made, and the arrays of its picture.
 
     Args:
-        model: as `load_compensation` gives it.
+        model, mechanism, how: as of `new_rows`.
         records: new rows of the uncompensated machine, what `load_records` takes.
-        mechanism: name or file of the nominal machine; the one that the model describes when None.
-        allow_code: run the Python file that the model names for a user's own mechanism.
-        columns: header in the records -> ``name[unit]`` or ``ignore``; those of the model's run when None or empty.
-        joint_map: joint -> sum of columns; that of the model's run when None or empty.
-        mechanism_keys: keys of the mechanism's constructor.
         seed: of the poses that are proposed.
 
     Raises:
         InputError: the rows lack a column, are not of this machine, or are too few.
     """
-    machine = nominal_mechanism(model, mechanism, allow_code, mechanism_keys)
-    names = [c.name for c in model.covariates]
-    there, counted = mapped_columns(model, records, machine)
-    maps = {"columns": columns or there, "joint_map": joint_map or counted}
-    loaded = load_records(records, machine, names, learns=False, **maps)
+    machine, loaded = new_rows(model, records, mechanism, **how)
     rows = _rows_of(model, machine, loaded)
     count = int(rows.groups.max()) + 1
     if count < FEWEST:
@@ -183,7 +165,6 @@ def what_changed(
 
 
 def _rows_of(model: LoadedModel, machine: Mechanism, loaded: Any) -> _Rows:
-    machine = as_measured(machine, loaded.pose_coordinates, loaded.path, loaded.pose)
     found = predict(model, machine, loaded, False)
     machine, joints = found.mechanism, found.joints
     covariates = {c.name: loaded.covariates[:, i] for i, c in enumerate(loaded.covariate_coordinates)}

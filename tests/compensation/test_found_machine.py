@@ -66,7 +66,7 @@ def test_it_says_that_rows_are_outside_what_was_measured(found: Path, tmp_path: 
     rows = torch.from_numpy((low + high) / 2 + torch.tensor([[0.0], [0.6]]).numpy() * (high - low))
     columns = {c.header: rows[:, i].numpy() for i, c in enumerate(model.joints)}
     write_table(tmp_path / "in.csv", columns | {c.header: [1.0, 1.0] for c in model.covariates})
-    said, _ = compensate_table(found, tmp_path / "in.csv", tmp_path / "out.csv")
+    said, _ = compensate_table(model, tmp_path / "in.csv", tmp_path / "out.csv")
     assert said[1] == "1 of them is outside what was measured (inside_domain = 0): geometry and effects hold there too."
 
 

@@ -11,7 +11,7 @@ from _machines import NOISE, measured, rows_of
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, diagnose_rows
 from ccnn_torch.diagnosis.residual.rows import frame_columns
-from ccnn_torch.diagnosis.shrink.by_block import cut
+from ccnn_torch.diagnosis.verdict.blocks import cut
 from ccnn_torch.effects import pose_residual
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ccnn_torch.diagnosis.verdict.fewest import fewest, together
+from ccnn_torch.diagnosis.verdict.blocks import fewest, together
 
 
 def test_an_error_is_in_one_of_the_numbers_that_do_the_same():

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.residual.tails import weights_of
+from ccnn_torch.diagnosis.residual.whitening import weights_of
 
 SIZES = torch.tensor([1.0, 0.5, 2.0, 1.5], dtype=torch.float64)
 

@@ -183,7 +183,6 @@ def test_distances_and_planes_identify_too(kind: str, tmp_path: Path) -> None:
         (["split.kind=block"], "split.kind: a constraint measures no positions"),
         (["split.kind=group", "split.by=[placement]"], "split: a socket of placement . has held-out rows but none"),
         (["methods=[hga]"], "methods: a constraint is identified by lm alone; write methods=\\[lm\\]"),
-        (["bootstrap=9"], "bootstrap: a constraint has the formula's intervals alone"),
         (["frame={base: true}"], "frame.base: a constraint has no known place"),
         (["frame={tool: true}"], "frame.tool: an arm has a tool offset of its own"),
         (["constraint.tolerance=0"], "constraint.tolerance: 0 is no standard deviation"),

@@ -13,10 +13,9 @@ import ccnn_torch
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.measured import make_kinematics
-from ccnn_torch.identification.page import identified_tables
+from ccnn_torch.identification.simulated import Places, PointsView
 from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
 from ccnn_torch.records import write_table
-from ccnn_torch.simulation.places import Places, PointsView
 
 FIVE_BAR: dict[str, Any] = {
     "machines": 60,
@@ -92,20 +91,6 @@ def test_each_leg_is_identified_from_its_own_poses_alone() -> None:
     # The noise was carried over one round earlier here: a small part of a standard deviation.
     bound = np.array([found.results["parameters"][n]["sd"] for n in ("l1", "L1", "A1x", "A1y", "k1", "gamma1")])
     assert np.abs(error / bound).max() < 0.05
-
-
-def test_bootstrap_says_nothing_of_what_the_rows_do_not_determine() -> None:
-    found = ccnn_torch.identify(mechanism="delta", bootstrap=2, simulate={"poses": 20, "test_poses": 5}).results
-    rows = {row[0].partition(" ")[0]: row for row in identified_tables(found)[0].rows}
-    assert rows["base1"][-2:] == ("not identifiable", "–") and rows["rod1"][-1] != "–"
-
-
-def test_bootstrap_agrees_with_the_formula() -> None:
-    found = ccnn_torch.identify(
-        mechanism="five_bar", bootstrap=150, simulate={"poses": 60, "test_poses": 5, "noise": 1e-5}
-    ).results["parameters"]
-    ratio = torch.tensor([p["sd_bootstrap"] / p["sd"] for p in found.values()])
-    assert 0.7 < float(ratio.min()) < float(ratio.max()) < 1.4
 
 
 def test_the_same_seed_gives_the_same_figures() -> None:

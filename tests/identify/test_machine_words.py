@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.compensation import load_compensation
-from ccnn_torch.identification.klipper import printer_table
+from ccnn_torch.identification.page import printer_table
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.kinds.machine_file import template
 from ccnn_torch.records import write_table

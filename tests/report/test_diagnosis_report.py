@@ -14,13 +14,11 @@ import pytest
 import torch
 from browser import find_browser, measured
 from diagnosis_cases import CASES, indistinguishable, none, one_effect, two_effects, with_rotation
-from matplotlib.figure import Figure
 from rich.console import Console
 from test_run_report import Page
 
 from ccnn_torch.diagnosis.page.data import About, about_of, signatures_of
-from ccnn_torch.diagnosis.page.figure_rows import signature_plot
-from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot, remainder_map, where_plot
+from ccnn_torch.diagnosis.page.figures import remainder_map, signature_plot
 from ccnn_torch.diagnosis.page.report import diagnosis_page, print_diagnosis, write_diagnosis_report
 from ccnn_torch.diagnosis.page.tables import (
     aside_table,
@@ -29,7 +27,6 @@ from ccnn_torch.diagnosis.page.tables import (
     gap_table,
     next_table,
     order_table,
-    parameter_table,
     quantity_text,
     region_table,
     shares,
@@ -71,11 +68,6 @@ def test_tables_hold_the_numbers() -> None:
     effects = effect_table(results)
     assert effects is not None and len(effects.rows) == len(results["effects"])
     assert effects.rows[0][:5] == ("compliance ●", "joint compliance under load", "0.98", "113.0", "93.0 [91.0, 95.0]")
-    parameters = parameter_table(results)
-    assert parameters is not None
-    assert parameters.rows[0] == ("compliance: q1", "4.100e-06", "2.0e-07", "3.71e-06 to 4.49e-06", "rad/(N·m)")
-    fewest = parameter_table(results, 1)
-    assert fewest is not None and [row[0] for row in fewest.rows] == ["compliance: q1"] and "The 1 that" in fewest.note
     regions = region_table(results, about)
     assert regions is not None
     assert regions.rows[0] == ("0 mm to 100 mm", "300 mm to 400 mm", "40.0", "34.0 to 46.0", "50")
@@ -184,11 +176,11 @@ def test_the_page_is_whole_and_fetches_nothing(folder: Path) -> None:
     page.feed(text)
     page.close()
     assert page.open == [] and "script" not in page.count and "link" not in page.count
-    assert page.count["svg"] == 6 == page.count["figcaption"] and page.count["table"] == 10
+    assert page.count["svg"] == 3 == page.count["figcaption"] and page.count["table"] == 10
     outside = {a for a in page.addresses if not a.startswith(("#", "data:"))}
     assert all((folder / address).is_file() for address in outside) and "diagnosis.json" in outside
     assert text.index('class="verdict"') < text.index("<svg") < text.index("What should be measured next?")
-    stems = ("machine", "gap", "probabilities", "signatures", "map", "where")
+    stems = ("machine", "signatures", "map")
     assert {p.name for p in (folder / "plots").iterdir()} == {f"{s}.svg" for s in stems}
 
 
@@ -200,7 +192,7 @@ def test_a_browser_shows_all_of_the_page(folder: Path, tmp_path: Path) -> None:
         assert seen["page"] <= seen["window"], "the page is wider than the window"
         assert seen["fetched"] == 0
         assert 0 < seen["verdict"]["top"] < 200 and seen["verdict"]["height"] > 20
-        assert len(seen["figures"]) == 6 and len(seen["tables"]) == 10
+        assert len(seen["figures"]) == 3 and len(seen["tables"]) == 10
         assert all(0.5 * min(width, 600) < f["width"] <= width and f["height"] > 60 for f in seen["figures"])
         assert "these data do not distinguish them" in seen["text"] and "&amp;" not in seen["text"]
 
@@ -265,53 +257,20 @@ def test_terminal_and_markdown_of_every_case(name: str) -> None:
 def test_pictures_of_every_case_show_the_numbers(name: str) -> None:
     results, tensors, labels = CASES[name]()
     arrays, about = _numpy(tensors), about_of(labels)
-    gap = gap_plot(results)
-    assert gap is not None
-    bars = [bar.get_width() for bar in gap.figure.axes[0].patches]
-    assert bars[0] == pytest.approx(results["gap"]["before"] / (1e-3 if results["gap"]["before"] > 1e-3 else 1e-6))
     verdict = results["verdict"]
-    texts = _texts(gap.figure)
-    assert (f"with {' + '.join(verdict['effects'])}" in texts) == bool(verdict["effects"] not in ([], ["outlier"]))
-    chances = probability_plot(results)
-    assert chances is not None
-    shown = _texts(chances.figure)
-    assert all(effect in shown for effect in verdict["effects"])
-    assert any("the temperature" in text for text in shown) == (name == "outside")
     signatures = signatures_of(arrays, labels, verdict["effects"])
     drawn = signature_plot(signatures, arrays, verdict["effects"])
     assert (drawn is None) == (name in ("none", "outlier", "bare"))
     assert drawn is None or len(drawn.figure.axes) == len(signatures)
     assert remainder_map(arrays, about) is not None
-    assert (where_plot(results, about) is None) == (name in ("none", "bare"))
 
 
-def _texts(figure: Figure) -> list[str]:
-    return [label.get_text() for axes in figure.axes for label in axes.get_yticklabels()]
-
-
-def test_a_bar_beyond_its_shrink_has_its_whisker_and_a_few_far_rows_are_cut_off() -> None:
-    results, tensors, labels = one_effect()
-    results["effects"][1] |= {"gap_after": 5e-4, "shrink": 0.0, "shrink_ci95": [0.0, 0.2], "probability": 0.1}
-    plot = gap_plot(results)
-    assert plot is not None
-    lines = [c for c in plot.figure.axes[0].collections if len(c.get_segments()) == 1]
-    assert np.array(lines[0].get_segments()[0])[:, 0].max() == pytest.approx(500.0)
+def test_a_few_far_rows_are_cut_off() -> None:
+    _, tensors, labels = one_effect()
     arrays = _numpy(tensors)
     arrays["signature.compliance.y"][3] = 1.0
     drawn = signature_plot(signatures_of(arrays, labels), arrays, ["compliance"])
     assert drawn is not None and drawn.figure.axes[0].get_ylim()[1] < 1000
-
-
-def test_whiskers_of_the_gap_are_the_shrink_turned_round() -> None:
-    results = two_effects()[0]
-    plot = gap_plot(results)
-    assert plot is not None
-    gap, floor = results["gap"]["before"], results["gap"]["noise_floor"]
-    # Lines across, in pairs with their ends: the last is that of the verdict.
-    lines = [c for c in plot.figure.axes[0].collections if len(c.get_segments()) == 1]
-    ends = np.array(lines[-1].get_segments()[0])[:, 0] * 1e-3
-    shrink = 1 - (ends**2 - floor**2) / (gap**2 - floor**2)
-    assert shrink[::-1] == pytest.approx(results["verdict"]["shrink_ci95"], abs=1e-9)
 
 
 def test_rows_without_a_place_are_drawn_over_the_joints() -> None:

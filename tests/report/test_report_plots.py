@@ -14,7 +14,7 @@ from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.colors import LogNorm
 from report_runs import arm_run
 
-from ccnn_torch.calibration.figures import alive_nodes, convergence_plot, network_plot, population_plot
+from ccnn_torch.calibration.figures import alive_nodes, convergence_plot, network_plot
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays
@@ -22,7 +22,6 @@ from ccnn_torch.report.figures import (
     Plot,
     inline_svg,
     joint_error_plot,
-    overview_plot,
     pose_error_plot,
     save_figure,
     workspace_plot,
@@ -43,9 +42,7 @@ def all_plots(arrays: RunArrays, history: dict[str, np.ndarray]) -> list[Plot | 
         joint_error_plot(arrays),
         pose_error_plot(arrays),
         workspace_plot(arrays),
-        overview_plot(arrays),
         convergence_plot(history, "ccnn", floor=1e-10, constant=1.55e-10, unit="m"),
-        population_plot(history, "ccnn"),
         network_plot(arrays.masks, arrays.weights, "ccnn", ["q1", "q2", "q3"]),
     ]
 
@@ -129,10 +126,9 @@ def test_a_machine_that_turns_is_seen_over_its_angles(arrays: RunArrays) -> None
     assert plot.figure.axes[2].get_ylabel() == "z [mm]"
 
 
-def test_a_machine_on_a_line_has_no_map_and_still_an_overview(arrays: RunArrays) -> None:
+def test_a_machine_on_a_line_has_no_map(arrays: RunArrays) -> None:
     line = replace(arrays, place=arrays.place * np.array([0, 0, 1]), map_place=None)
     assert workspace_plot(line) is None
-    assert len(overview_plot(line).figure.axes) == 1
 
 
 def test_thousands_of_dots_become_pixels(tmp_path: Path) -> None:
@@ -176,7 +172,6 @@ def test_convergence_draws_the_median_over_repeats(history: dict[str, np.ndarray
     assert set(dots(plot, 1, "noise floor")) == {1e-10} and set(dots(plot, 1, "constant")) == {1.55e-10}
     assert convergence_plot({"step": history["step"]}, "x") is None
     assert convergence_plot({name: values[:1] for name, values in history.items()}, "constant") is None
-    assert population_plot({"step": history["step"]}, "x") is None
 
 
 def reachable(masks: list[np.ndarray]) -> list[np.ndarray]:

@@ -1,4 +1,4 @@
-"""Tables, CSV, HTML, TensorBoard and the picture command, read back and compared with the numbers they came from."""
+"""Tables, CSV, HTML, and TensorBoard, read back and compared with the numbers they came from."""
 
 from __future__ import annotations
 
@@ -12,18 +12,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import typer
 from PIL import Image
 from report_runs import arm_run, tripod_run
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from typer.testing import CliRunner
 
 from ccnn_torch.calibration.callbacks import EventFile, TensorBoardCallback, tags_of
-from ccnn_torch.calibration.figures import make_picture, write_report
+from ccnn_torch.calibration.figures import write_report
 from ccnn_torch.calibration.page import long_table, result_tables, run_page, verdict, worse_text
 from ccnn_torch.calibration.statistics import spread
-from ccnn_torch.cli.with_model import picture
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.results.run import RmsMax, RunResults
@@ -37,7 +34,7 @@ def test_the_report_folder(report_folder: Path) -> None:
     names = {p.name for p in report_folder.iterdir()}
     assert {"results.csv", "results.md", "report.html", "plots"} <= names
     plots = {p.name for p in (report_folder / "plots").iterdir()}
-    stems = ("pose_error", "workspace", "joint_errors", "network_ccnn", "convergence_ccnn", "population_ccnn")
+    stems = ("pose_error", "workspace", "joint_errors", "network_ccnn", "convergence_ccnn")
     assert plots == {f"{stem}.svg" for stem in stems}
 
 
@@ -80,7 +77,7 @@ def test_the_page_is_whole_and_fetches_nothing(report_folder: Path) -> None:
     page.feed(text)
     page.close()
     assert page.open == []
-    assert page.count["svg"] == 6 == page.count["figcaption"] and page.count["table"] == 5
+    assert page.count["svg"] == 5 == page.count["figcaption"] and page.count["table"] == 5
     assert "script" not in page.count and "link" not in page.count
     outside = [a for a in page.addresses if not a.startswith(("#", "data:"))]
     assert set(outside) == {"results.json", "results.csv", "config.yaml"}
@@ -237,45 +234,22 @@ def test_event_files_of_one_second_sort_in_the_order_they_were_opened(tmp_path: 
     assert sorted(opened) == opened
 
 
-def test_errors_stand_against_evaluations_and_time_too_and_outlive_a_resume(tmp_path: Path) -> None:
+def test_errors_stand_against_the_time_too_and_outlive_a_resume(tmp_path: Path) -> None:
     error = torch.linspace(2, 1, 40, dtype=torch.float64).view(20, 2)
-    counted = 7 * torch.arange(1, 21).unsqueeze(1).expand(20, 2)
     clock = 0.05 * torch.arange(1, 21, dtype=torch.float64)
 
     def steps(first: int, last: int) -> None:
-        # What a checkpoint of the step before would hold.
-        past = {"heldout_mse_all": error[: first - 1], "evaluations": counted[: first - 1]}
-        callback = TensorBoardCallback(tmp_path, past=lambda: (past, clock[: first - 1]))
+        callback = TensorBoardCallback(tmp_path)
         callback.on_start(None, None, first - 1)
         for i in range(first - 1, last):
-            seconds = clock[i].expand(2)
-            callback.on_step(i + 1, {"heldout_mse_all": error[i], "evaluations": counted[i], "seconds": seconds})
+            callback.on_step(i + 1, {"heldout_mse_all": error[i], "seconds": clock[i].expand(2)})
         callback.on_end()
 
     steps(1, 15)
     # Killed after step 15, the last checkpoint at step 12.
     steps(13, 20)
     events = EventAccumulator(str(tmp_path), size_guidance={"scalars": 0}).Reload()
-    plain, evaluations, time = (
-        events.Scalars(tag) for tag in ("heldout/mse_all", "by_evaluations/heldout_mse_all", "by_time/heldout_mse_all")
-    )
-    assert [s.step for s in plain] == list(range(1, 21))
-    found = sorted((s.step, s.value) for s in evaluations)
-    assert [step for step, _ in found] == [7 * k for k in range(1, 21)]
-    assert [value for _, value in found] == pytest.approx(error.mean(1).tolist(), rel=1e-6)
-    assert sorted(s.step for s in time) == [50 * k for k in range(1, 21)]
-    resumed = {s.step: s.wall_time for s in time}
-    assert resumed[1000] - resumed[650] == pytest.approx(0.35, abs=1e-3)
-
-
-def test_the_picture_command(run_folder: Path) -> None:
-    app = typer.Typer()
-    app.command()(picture)
-    target = run_folder / "docs" / "picture.png"
-    done = CliRunner().invoke(app, [str(run_folder), str(target), "--joint", "q2"])
-    assert done.exit_code == 0 and "joint q2" in done.output
-    with Image.open(target) as drawn:
-        width, height = drawn.size
-    assert width > 2.5 * height and width >= 1500
-    with pytest.raises(InputError, match="no joint 'q9'; this run has q1, q2, q3"):
-        make_picture(run_folder, target, "q9")
+    found = events.Scalars("heldout/mse_all")
+    assert [s.step for s in found] == list(range(1, 21))
+    assert [s.value for s in found] == pytest.approx(error.mean(1).tolist(), rel=1e-6)
+    assert found[19].wall_time - found[12].wall_time == pytest.approx(0.35, abs=1e-3)

@@ -6,7 +6,6 @@ import pytest
 from diagnosis_cases import CASES, indistinguishable, none, one_effect, outlier, outside, two_effects, with_rotation
 
 from ccnn_torch.diagnosis.page.data import About
-from ccnn_torch.diagnosis.page.figures import gap_plot
 from ccnn_torch.diagnosis.page.tables import (
     gap_table,
 )
@@ -79,7 +78,6 @@ def test_gaps_that_cannot_be_put_against_a_floor() -> None:
     turning["gap_rotation"] = None
     assert [row[0] for row in gap_table(turning, About()).rows] == ["rotation [µrad]"]
     turning["gap"]["before"] = 0.0
-    assert gap_plot(turning) is None
     assert verdict_text(turning).startswith("There is no gap between model and machine")
 
 

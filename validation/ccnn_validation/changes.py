@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from ccnn_torch import since
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.records import read_table, write_table
-from ccnn_torch.report.results.since import SinceResults
+from ccnn_torch.report.results.verify import SinceResults
 
 Array = NDArray[np.float64]
 ZERO, GAIN, MOTION = 5e-4, 5e-4, 5e-4

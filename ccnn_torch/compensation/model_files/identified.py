@@ -16,7 +16,7 @@ from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.found_machine import FoundMachine, machine_of_block
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.mechanisms import Mechanism, mechanism_from_description, mechanism_of_file
+from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
 from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
 
 
@@ -66,7 +66,7 @@ def load_machine(path: str | Path, *, allow_code: bool = False) -> Mechanism:
     model = load_compensation(path, allow_code=allow_code)
     if model.machine is not None:
         return model.machine.identified
-    mechanism = mechanism_from_description(model.facts["mechanism"], allow_code)
+    mechanism = model.mechanism(allow_code)
     identified = model.facts.get("machine", {}).get("identified")
     return mechanism if identified is None else mechanism.with_nominal(torch.tensor(identified, dtype=torch.float64))
 

@@ -31,7 +31,7 @@ from ccnn_torch.compensation.model_files.signature import check_signature
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError, raise_if_out_of_memory
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.plugins import code_refused
 
 MODEL_FORMS, MACHINE_FORMS = (".safetensors", ".onnx"), (".yaml", ".yml", ".json")
@@ -342,6 +342,15 @@ class LoadedModel:
         """Ideal joints of commands (or of joints fed back), `... x n` [SI]; arguments and errors as a call."""
         return self(command, covariates)["ideal"]
 
+    def mechanism(self, allow_code: bool = False) -> Mechanism:
+        """The nominal mechanism that it was made for, its frames as they were fitted then.
+
+        Raises:
+            InputError: it is a user's own and `allow_code` is not given, or its file is missing.
+        """
+        with code_refused(f"{self.path}: its mechanism", allow_code):
+            return mechanism_from_description(self.facts["mechanism"], allow_code=True)
+
     def require_mechanism(self, mechanism: Mechanism) -> None:
         """Refuse a mechanism that the model was not made for.
 
@@ -363,7 +372,7 @@ class LoadedModel:
             raise ModelFileError(
                 f"{self.path}: this model was made for {mechanism.name} with {wrong[0]} = {ours[wrong[0]]:g}, not "
                 f"{theirs.get(wrong[0])}; build the mechanism from the model: "
-                "mechanism_from_description(model.facts['mechanism'])"
+                "model.mechanism()"
             )
 
     def hook_for(self, mechanism: Mechanism) -> Hook:

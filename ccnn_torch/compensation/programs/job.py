@@ -9,10 +9,9 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from ccnn_torch.compensation.job import ROWS, nearest_measured
-from ccnn_torch.compensation.model_files.load import LoadedModel, load_compensation
+from ccnn_torch.compensation.job import ROWS, frames_of, nearest_measured
+from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.programs import G_CODE
 from ccnn_torch.compensation.programs.gcode import GCode
 from ccnn_torch.compensation.programs.literals import Krl, Rapid
@@ -22,10 +21,9 @@ from ccnn_torch.display import plain
 from ccnn_torch.errors import FallbackWarning, InputError
 from ccnn_torch.files.read import read_bytes
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.mechanisms import SerialArm, mechanism_from_description
+from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.branches import ROUNDED, arrives, follow
-from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
-from ccnn_torch.plugins import code_refused
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 from ccnn_torch.records.joint_map import read_joint_map
 
 _LARGEST = 100_000_000
@@ -66,9 +64,7 @@ class Corrections:
         Raises:
             InputError: `tool` of a machine that is no arm.
         """
-        with code_refused(f"{loaded.path}: its mechanism", allow_code):
-            described = mechanism_from_description(loaded.facts["mechanism"], allow_code=True)
-        machine = described.controlled()
+        machine = loaded.mechanism(allow_code).controlled()
         if isinstance(machine, SerialArm):
             keys = machine.recipe["keys"] | ({} if tool is None else {"tool": list(tool)})
             slides = len(machine.joints) <= 3
@@ -76,7 +72,7 @@ class Corrections:
         elif tool is not None:
             raise InputError(f"--tool: {loaded.path} was made for {machine.name}, which is no arm; leave it out")
         self._loaded, self._machine = loaded, machine
-        self._base = np.eye(4) if base is None else _matrix(torch.tensor(list(base), dtype=torch.float64))
+        self._base = np.eye(4) if base is None else frames_of(torch.tensor([*base], dtype=torch.float64)).numpy()
         self._counted = read_joint_map(loaded.joint_map, loaded.joints, loaded.columns)
         # The file of geometry alone does not say where it was measured: its geometry holds as far as the joints go.
         self._region = None
@@ -204,10 +200,9 @@ class Corrections:
 
 
 def compensate_program(
-    model: Path,
+    loaded: LoadedModel,
     input: Path,
     output: Path,
-    public_key: Path | None = None,
     allow_code: bool = False,
     tool: Sequence[float] | None = None,
     base: Sequence[float] | None = None,
@@ -215,10 +210,9 @@ def compensate_program(
     """Write a program with the positions to command; all else stays, byte by byte.
 
     Args:
-        model: as of `compensate_table`.
+        loaded: as `load_compensation` gives it.
         input, output: programs of G-code, KRL or RAPID; by the ending of their names.
-        public_key, allow_code: as of `load_model`.
-        tool, base: as of `Corrections`.
+        allow_code, tool, base: as of `Corrections`.
 
     Returns:
         Sentences on what was changed; and one on the positions that were left, else empty.
@@ -226,7 +220,6 @@ def compensate_program(
     Raises:
         InputError: the program cannot be read, or has what its positions do not follow; nothing is written then.
     """
-    loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     corrections = Corrections(loaded, allow_code, tool, base)
     corrections.require(input)
     # Every byte is a letter of this code, and comes back as it was.
@@ -305,9 +298,3 @@ def _refused(input: Path, output: Path, points: Sequence[Point], reasons: Sequen
 
 def _at(lines: Sequence[int]) -> str:
     return f"line{'s' * (len(lines) > 1)} {', '.join(map(str, lines[:_NAMED]))}{' …' * (len(lines) > _NAMED)}"
-
-
-def _matrix(pose: Tensor) -> Array:
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = rotation_vector_to_matrix(pose[3:]).numpy(), pose[:3].numpy()
-    return found

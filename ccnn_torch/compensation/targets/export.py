@@ -25,7 +25,7 @@ from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.display import plain
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
+from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
 
@@ -82,10 +82,9 @@ class _Order:
     def mechanism(self) -> Mechanism:
         if self.model.machine is not None:
             return self.model.machine.identified
-        described = self.model.facts["mechanism"]
-        if "spec" not in described:
+        if "spec" not in self.model.facts["mechanism"]:
             raise ModelFileError(f"{self.path}: this target needs the machine's kinematics, which the model lacks")
-        return mechanism_from_description(described, self.allow_code)
+        return self.model.mechanism(self.allow_code)
 
 
 def _linuxcnc(order: _Order) -> dict[str, str]:
@@ -150,6 +149,7 @@ def export_model(
     public_key: str | Path | None = None,
     allow_code: bool = False,
     current: str | Path | None = None,
+    tell: Callable[[str], None] = lambda left: None,
 ) -> dict[str, Path]:
     """Write a model as source code, table or file of a controller, robot or simulator.
 
@@ -161,6 +161,7 @@ def export_model(
         sd: with a function for the standard deviation of the deviation.
         public_key, allow_code: as `load_model`.
         current: the user's own file of a stack, from which names and numbers are taken that a machine does not have.
+        tell: is given what the files leave of the machine's error, where they do not hold all of the model.
 
     Returns:
         The files by name.
@@ -171,20 +172,6 @@ def export_model(
         MethodFailedError: the model cannot be expressed so, or single precision does not hold it.
         WriteError: a file cannot be written.
     """
-    return export_told(path, to, out, dtype, sd, public_key, allow_code, current)[0]
-
-
-def export_told(
-    path: str | Path,
-    to: str,
-    out: str | Path,
-    dtype: str = "float64",
-    sd: bool = False,
-    public_key: str | Path | None = None,
-    allow_code: bool = False,
-    current: str | Path | None = None,
-) -> tuple[dict[str, Path], str]:
-    """As `export_model`, and what the files leave of the machine's error; empty where they hold all of the model."""
     for value, known, what in ((to, [*TARGETS], "target"), (dtype, DTYPES, "dtype")):
         if value not in known:
             near = nearest(value, known)
@@ -199,4 +186,6 @@ def export_told(
     contents = TARGETS[to](order)
     for name, content in contents.items():
         write_whole(folder / name, content)
-    return {name: folder / name for name in contents}, order.said
+    if order.said:
+        tell(order.said)
+    return {name: folder / name for name in contents}

@@ -18,7 +18,7 @@ from ccnn_torch.compensation.parts import ROWS, all_over
 from ccnn_torch.display import number_text, plain
 from ccnn_torch.effects import Situation, measured_pose, reached
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
+from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.mechanism_file import chain_of
 from ccnn_torch.mechanisms.pose import frame_gap
@@ -52,7 +52,7 @@ class Found:
         if self.model.machine is not None:
             machine = self.model.machine.nominal
         else:
-            machine = mechanism_from_description(self.model.facts["mechanism"], self.allow_code)
+            machine = self.model.mechanism(self.allow_code)
         values = machine.nominal.clone()
         if isinstance(machine, SerialArm):
             values[:6], values[-6:] = self._values[:6], self._values[-6:]
@@ -69,7 +69,7 @@ class Found:
         compensator = self.model.compensator
         if compensator is not None and compensator.machine is not None:
             return compensator.machine.identified
-        return mechanism_from_description(self.model.facts["mechanism"], self.allow_code).nominal
+        return self.model.mechanism(self.allow_code).nominal
 
     @cached_property
     def rows(self) -> Situation:
@@ -102,7 +102,7 @@ class Found:
                 return torch.cat([there.position, *turns], -1)
             # The ideal joints are those at which the nominal machine is where the real one is.
             ideal = compensator.back(joints, given)
-        made_for = mechanism_from_description(self.model.facts["mechanism"], self.allow_code)
+        made_for = self.model.mechanism(self.allow_code)
         return made_for.forward_kinematics(ideal)
 
     @property

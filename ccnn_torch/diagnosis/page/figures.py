@@ -1,9 +1,8 @@
-"""Pictures of a diagnosis: the gap against the floor, probabilities, where it lies, and the course of a motion."""
+"""Pictures of a diagnosis: signatures of effects, the gap over the workspace, a motion."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,151 +11,153 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.diagnosis.page.data import About, gaps_of, used_rows
-from ccnn_torch.diagnosis.page.tables import shares
-from ccnn_torch.diagnosis.verdict.text import driver_words, floor_words, probability_words
-from ccnn_torch.display import display_unit, number_text
+from ccnn_torch.diagnosis.page.data import About, Signature, used_rows
+from ccnn_torch.display import display_unit, unit_text
 from ccnn_torch.motion.stretches import PHASES
-from ccnn_torch.report.figures import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, draw_pairs, height_of, planes_of, styled
-
-Block = Mapping[str, Any]
-_LIKE = SERIES[4]
-# Candidates below this probability are not drawn one by one.
-_LEAST = 0.01
-_DRAWN = 12
-
-
-@styled
-def gap_plot(results: Block) -> Plot | None:
-    """The gap before, with each effect alone, and with all of the verdict, as bars against the noise floor."""
-    shown = [(name, block) for name, block in gaps_of(results) if block["before"]]
-    if not shown:
-        return None
-    bars = {name: _bars(results, block, alone=name == shown[0][0]) for name, block in shown}
-    heights = [len(bars[name]) + 1.6 for name, _ in shown]
-    figure = Figure(figsize=(8.4, 0.34 * sum(heights) + 0.5 * len(shown)), layout="tight")
-    grid = figure.subplots(len(shown), 1, squeeze=False, height_ratios=heights)[:, 0]
-    for axes, (name, block) in zip(grid, shown, strict=True):
-        scale, unit = display_unit(block["unit"], block["before"])
-        reach = max(max(value, ends[1] if ends else 0.0) for _, value, ends, _ in bars[name]) / scale
-        _draw_bars(axes, bars[name], reach, scale, unit)
-        axes.set_xlim(0, 1.16 * reach)
-        floor = block["noise_floor"]
-        if floor is not None:
-            label = f"{floor_words(results)} {number_text(floor / scale, 3)} {unit}"
-            # An estimate is no bound, and not drawn as one.
-            dashes = ":" if results.get("noise") == "estimated" else "--"
-            axes.axvline(floor / scale, color=FLOOR, linestyle=dashes, label=label)
-            axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
-        axes.set_xlabel(f"{name} gap, RMS on data not used for fitting [{unit}]")
-        axes.set_title(f"{name.capitalize()} gap")
-    caption = (
-        "How far the model is from the machine on data not used for fitting: as it is, with one effect alone, and "
-        "with all effects of the verdict. Whiskers: 95 % intervals. Dashed: the noise as given or as the records show "
-        "it. Dotted: an estimate of the noise, which may hold another cause, so that a model can get below it."
-    )
-    return Plot("gap", figure, caption)
-
-
-Bar = tuple[str, float, tuple[float, float] | None, str]
-
-
-def _bars(results: Block, block: Block, *, alone: bool) -> list[Bar]:
-    verdict, floor = results["verdict"], block["noise_floor"] or 0.0
-    bars: list[Bar] = [("model as it is", block["before"], None, BEFORE)]
-    if alone:
-        for e in results["effects"]:
-            if e["gap_after"] is None or not (e["name"] in verdict["effects"] or e["probability"] >= _LEAST):
-                continue
-            ends = _ends(block["before"], floor, e["shrink_ci95"])
-            bars.append((f"with {e['name']} alone", e["gap_after"], ends, _LIKE))
-            if len(bars) > 8:
-                break
-    if verdict["effects"]:
-        ends = _ends(block["before"], floor, verdict["shrink_ci95"]) if alone else None
-        bars.append((_all_words(verdict["effects"]), block["after"], ends, AFTER))
-    network = results.get("network") or {}
-    if alone and network.get("gap_after") is not None:
-        low, high = network["gap_after_ci95"]
-        bars.append(("and a network on the remainder", network["gap_after"], (low, high), SERIES[2]))
-    # One effect alone is all of the verdict then: one bar shows it.
-    if len(verdict["effects"]) == 1:
-        bars = [bar for bar in bars if bar[0] != f"with {verdict['effects'][0]} alone"]
-    return [bar for bar in bars if bar[1] is not None]
-
-
-def _ends(before: float, floor: float, interval: list[float] | None) -> tuple[float, float] | None:
-    """The gap's interval from that of its shrink, whose definition turned round."""
-    if interval is None:
-        return None
-    low, high = (math.sqrt(floor**2 + (1 - s) * max(before**2 - floor**2, 0.0)) for s in reversed(interval))
-    return low, high
-
-
-def _draw_bars(axes: Axes, bars: list[Bar], reach: float, scale: float = 1.0, unit: str = "") -> None:
-    """Bars with their sizes beside them, in a unit of that scale [SI], or of probabilities; reach: of the longest."""
-    for i, (_, value, ends, colour) in enumerate(bars):
-        right = size = value / scale
-        axes.barh(i, size, height=0.62, color=colour)
-        if ends is not None:
-            # A shrink is never below 0, but an effect that is not there makes the gap larger on rows it has not seen.
-            left, right = min(ends[0] / scale, size), max(ends[1] / scale, size)
-            axes.hlines(i, left, right, color="#222222", linewidth=1.3)
-            axes.vlines([left, right], i - 0.13, i + 0.13, color="#222222", linewidth=1.3)
-        text = f"{number_text(size, 3)} {unit}" if unit else probability_words(size)
-        axes.text(right + 0.012 * reach, i, text, va="center", fontsize=9)
-    axes.set_yticks(range(len(bars)), [bar[0] for bar in bars])
-    axes.set_ylim(len(bars) - 0.4, -0.6)
-    axes.grid(axis="y", visible=False)
-
-
-def _all_words(names: list[str]) -> str:
-    return "without the bad rows" if names == ["outlier"] else f"with {' + '.join(names)}"
-
-
-@styled
-def probability_plot(results: Block) -> Plot | None:
-    """How probable each candidate is; the verdict's stand out, and what cannot be distinguished from them is
-    lighter."""
-    verdict = results["verdict"]
-    names = set(verdict["effects"])
-    like = {n for e in results["effects"] if e["name"] in names for n in e["indistinguishable_from"]} - names
-    probability = verdict["probability"]
-    bars: list[Bar] = []
-    if verdict["none"]:
-        bars.append(("none: noise only", probability, None, AFTER))
-    if verdict["outside_library"]:
-        bars.append((f"outside the library:\n{driver_words(verdict['driver'])}", probability, None, BEFORE))
-    listed = {e["name"] for e in results["effects"]}
-    bars += [(name, probability, None, AFTER) for name in verdict["effects"] if name not in listed]
-    for e in results["effects"]:
-        if len(bars) < _DRAWN and (e["name"] in names | like or e["probability"] >= _LEAST):
-            colour = AFTER if e["name"] in names else _LIKE if e["name"] in like else GREY
-            bars.append((e["name"], e["probability"], None, colour))
-    if not bars:
-        return None
-    figure = Figure(figsize=(8.4, 0.34 * len(bars) + 1.0), layout="tight")
-    axes = figure.subplots()
-    _draw_bars(axes, bars, 1.0)
-    axes.set_xlim(0, 1.14)
-    axes.set_xticks([0, 0.25, 0.5, 0.75, 1.0])
-    axes.set_xlabel("probability [1]")
-    hidden = len(listed) - sum(bar[0] in listed for bar in bars)
-    caption = "How probable each explanation is after seeing these rows: dark blue, in the verdict"
-    caption += "; light blue, not distinguished from one in the verdict by these rows" if like else ""
-    caption += "; orange, something that no effect of the library describes" if verdict["outside_library"] else ""
-    return Plot("probabilities", figure, caption + (f". {hidden} further effects were tried." if hidden else "."))
-
+from ccnn_torch.report.figures import (
+    AFTER,
+    BEFORE,
+    FLOOR,
+    GREY,
+    RASTER_ABOVE,
+    SERIES,
+    Plot,
+    maps,
+    planes_of,
+    styled,
+)
 
 Array = NDArray[np.float64]
-# Groups of shares that are parts of the machine; the others are conditions of the rows.
-_OF_MACHINE = ("outputs", "joints", "legs")
-# Space between two groups of bars, in bars.
-_GAP = 0.6
+Arrays = Mapping[str, Array]
+_KELVIN = 273.15
+# A driver with no more values than this (a direction, a load put on or not) is drawn as columns of points.
+_FEW = 6
+# Share of the fit's variance between neighbours along the driver up to which a line shows it all.
+_SMOOTH = 0.03
 
 
 @styled
-def remainder_map(arrays: Mapping[str, Array], about: About) -> Plot | None:
+def signature_plot(signatures: Sequence[Signature], arrays: Arrays, effects: Sequence[str] = ()) -> Plot | None:
+    """A panel for each signature.
+
+    Args:
+        signatures: in reading order.
+        arrays: for which rows were held out and set aside.
+        effects: names in the verdict; any other signature is that of a driver outside the library.
+    """
+    if not signatures:
+        return None
+    columns = min(2, len(signatures))
+    lines = -(-len(signatures) // columns)
+    figure = Figure(figsize=(4.7 * columns if columns > 1 else 6.4, 3.3 * lines + 0.35), layout="constrained")
+    panels = list(figure.subplots(lines, columns, squeeze=False).flat)
+    texts = []
+    for axes, signature in zip(panels, signatures, strict=False):
+        held, aside = used_rows(arrays, len(signature.x))
+        name = signature.effect if signature.effect in effects else f"outside the library: {signature.effect}"
+        axes.set_title(name)
+        _draw(axes, signature, held, aside)
+        judged = held & ~aside if (held & ~aside).sum() > 2 else ~aside
+        share = _explained(signature.y[judged], signature.fit[judged])
+        if share is not None:
+            texts.append(f"{name} {100 * share:.3g} %")
+    for axes in panels[len(signatures) :]:
+        axes.set_axis_off()
+    handles = {
+        label: handle
+        for axes in panels[: len(signatures)]
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(handles))
+    caption = (
+        "What gives each effect away: the residual along the effect's own direction, the other effects taken off, "
+        "against what drives it."
+    )
+    if "set aside" in handles:
+        caption += " Crosses: rows set aside, at the edge where they lie beyond it."
+    if texts:
+        caption += f" Share of the drawn variance on rows not used for fitting that the fit takes: {', '.join(texts)}."
+    return Plot("signatures", figure, caption)
+
+
+def axis_values(values: Array, axis: Coordinate) -> tuple[Array, str]:
+    """Values for an axis and its label: lengths in mm, temperatures in °C."""
+    if axis.unit == "K":
+        return values - _KELVIN, f"{axis.name} [°C]"
+    scale, unit = (1e-3, "mm") if axis.unit == "m" else (1.0, unit_text(axis.unit))
+    return values / scale, f"{axis.name} [{unit}]"
+
+
+def _draw(axes: Axes, signature: Signature, held: NDArray[np.bool_], aside: NDArray[np.bool_]) -> None:
+    x, x_label = axis_values(signature.x, signature.x_axis)
+    typical = float(np.nanquantile(np.abs(signature.y[~aside]), 0.9)) if (~aside).any() else 1.0
+    scale, unit = display_unit(signature.y_axis.unit, typical or 1.0)
+    y, fit = signature.y / scale, signature.fit / scale
+    values = np.unique(x[np.isfinite(x)])
+    few = len(values) <= _FEW
+    step = float(np.diff(values).min()) if len(values) > 1 else 1.0
+    # Spread in order of the rows, not at random: the same file gives the same picture.
+    shift = 0.5 * step * ((np.arange(len(x)) * 0.6180339887498949) % 1 - 0.5) if few else np.zeros(len(x))
+    raster = len(x) > RASTER_ABOVE
+    size = float(np.clip(3000 / len(x), 4, 18))
+    for rows, colour, label in ((~held & ~aside, GREY, "rows fitted on"), (held & ~aside, AFTER, "rows held out")):
+        if rows.any():
+            axes.scatter((x + shift)[rows], y[rows], s=size, color=colour, linewidths=0, label=label, rasterized=raster)
+    # Of a row next to a singularity there is nothing to draw.
+    shown = aside & (np.abs(y) + np.abs(fit) > 0)
+    if shown.any():
+        _draw_aside(axes, (x + shift)[shown], y[shown], y[~aside])
+    _keep_to_most(axes, np.concatenate([y[~aside], fit[~aside]]))
+    _draw_fit(axes, x[~aside], fit[~aside], values if few else None, step, size)
+    axes.axhline(0, color=FLOOR, linewidth=0.8)
+    axes.set(xlabel=x_label, ylabel=f"{signature.y_axis.name} [{unit}]")
+    if few:
+        axes.set_xticks(values)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+
+
+def _keep_to_most(axes: Axes, values: Array) -> None:
+    """Cut the axis where a few rows next to a singularity would press all others onto one line."""
+    low, high = (float(v) for v in np.nanquantile(values, (0.01, 0.99)))
+    whole = (float(np.nanmin(values)), float(np.nanmax(values)))
+    if whole[1] - whole[0] > 2.5 * (high - low) > 0:
+        axes.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
+        axes.annotate("a few rows lie beyond", (0.99, 0.02), xycoords="axes fraction", ha="right", fontsize=8)
+
+
+def _draw_aside(axes: Axes, x: Array, y: Array, others: Array) -> None:
+    """Rows set aside, drawn at the edge where they lie far beyond all others."""
+    low, high = (float(v) for v in np.nanquantile(others, (0, 1)))
+    margin = 0.15 * (high - low)
+    axes.scatter(
+        x, np.clip(y, low - margin, high + margin), s=26, marker="x", color="#222222", linewidths=1.1, label="set aside"
+    )
+
+
+def _draw_fit(axes: Axes, x: Array, fit: Array, values: Array | None, step: float, size: float) -> None:
+    if values is not None:
+        means = [float(fit[x == value].mean()) for value in values]
+        axes.hlines(means, values - 0.32 * step, values + 0.32 * step, color=BEFORE, linewidth=2.2, label="fit")
+        return
+    order = np.argsort(x, kind="stable")
+    ordered = fit[order]
+    rough = float(np.square(np.diff(ordered)).mean()) / 2
+    # A constant offset is a line as well, even if rounding leaves some variance.
+    if rough <= _SMOOTH * float(ordered.var()) or rough < 1e-6 * float(np.square(ordered).mean()):
+        axes.plot(x[order], ordered, color=BEFORE, linewidth=2, label="fit")
+    else:
+        axes.scatter(x, fit, s=size, color=BEFORE, linewidths=0, alpha=0.8, label="fit")
+
+
+def _explained(y: Array, fit: Array) -> float | None:
+    known = np.isfinite(y + fit)
+    if known.sum() < 3 or not (variance := float(np.square(y[known]).mean())):
+        return None
+    return max(0.0, 1 - float(np.square((y - fit)[known]).mean()) / variance)
+
+
+@styled
+def remainder_map(arrays: Arrays, about: About) -> Plot | None:
     """The gap over the workspace as the model is, and what the verdict's effects leave.
 
     A machine whose position does not span a plane is drawn over its first joints.
@@ -179,28 +180,14 @@ def remainder_map(arrays: Mapping[str, Array], about: About) -> Plot | None:
     place, before, after = place[known], before[known], after[known]
     if not len(before) or not before.max() > 0:
         return None
-    planes = planes_of(place, axes)
-    shapes = [height_of(place, axes, plane) for plane in planes]
-    figure = Figure(figsize=(9.2, sum(3.6 * shape + 0.85 for shape in shapes)), layout="constrained")
-    grid = figure.subplots(len(planes), 2, squeeze=False, height_ratios=shapes)
-    text = draw_pairs(
-        figure,
-        grid,
-        axes,
-        planes,
-        place,
-        before,
-        after,
-        titles=("Model as it is", "What the verdict leaves"),
-        quantity=quantity,
-        si_unit=unit,
-    )
+    titles = "Model as it is", "What the verdict leaves"
+    figure, text = maps(axes, place, before, after, titles=titles, quantity=quantity, si_unit=unit)
     which = "rows not used for fitting" if (held & ~aside).any() else "rows"
     caption = f"The {quantity} over the {over}, on {len(before)} {which}, on one scale: {text}. A pattern that is left "
     return Plot("map", figure, caption + "on the right is not explained; noise has none.")
 
 
-def _places(arrays: Mapping[str, Array], about: About) -> tuple[Array, tuple[Coordinate, ...], str] | None:
+def _places(arrays: Arrays, about: About) -> tuple[Array, tuple[Coordinate, ...], str] | None:
     """Coordinates to draw over, their names, and what they are."""
     place = tuple(Coordinate(name, "m") for name in "xyz")
     joints = tuple(Coordinate(f"q{i + 1}", about.unit(f"q{i + 1}")) for i in range(_width(arrays.get("joints"))))
@@ -216,42 +203,6 @@ def _width(values: Array | None) -> int:
     return 0 if values is None else int(values.shape[1])
 
 
-@styled
-def where_plot(results: Block, about: About) -> Plot | None:
-    """Shares of the gap by output, joint and leg, and beside them by covariate regime; None where there is no gap."""
-    if results["verdict"]["none"]:
-        return None
-    parts = list(shares(results, about))
-    machine = [part for part in parts if part[0] in _OF_MACHINE]
-    columns = [column for column in (machine, parts[len(machine) :]) if column]
-    if not columns:
-        return None
-    lengths = [len(column) + _GAP * len({part[0] for part in column}) for column in columns]
-    figure = Figure(figsize=(4.7 * len(columns), 0.3 * max(lengths) + 0.8), layout="tight")
-    # Few axes: each costs more than its bars.
-    grid = figure.subplots(1, len(columns), squeeze=False)[0]
-    reach = max(max(share, interval[1] if interval else 0.0) for _, _, share, interval in parts)
-    for axes, column in zip(grid, columns, strict=True):
-        starts = [i > 0 and part[0] != column[i - 1][0] for i, part in enumerate(column)]
-        y = np.arange(len(column)) + _GAP * np.cumsum(starts)
-        axes.barh(y, [100 * share for _, _, share, _ in column], height=0.62, color=AFTER)
-        for at, (_, _, share, interval) in zip(y, column, strict=True):
-            end = share
-            if interval is not None:
-                axes.hlines(at, 100 * interval[0], 100 * interval[1], color="#222222", linewidth=1.3)
-                end = max(share, interval[1])
-            axes.text(100 * (end + 0.015 * reach), at, f"{100 * share:.0f} %", va="center", fontsize=8.5)
-        axes.set_yticks(y, [part for _, part, _, _ in column])
-        axes.set_ylim(max(lengths) - _GAP - 0.4, -0.6)
-        axes.set_xlim(0, 115 * reach)
-        axes.set_title("By output, joint and leg" if column is machine else "By condition")
-        axes.set_xlabel("share of the gap [%]")
-        axes.grid(axis="y", visible=False)
-    caption = "Which share of the gap (of its mean square) lies where; lines are 95 % intervals where they are known."
-    return Plot("where", figure, caption)
-
-
-Arrays = Mapping[str, NDArray[np.float64]]
 # Joints that are drawn, those with the largest gap.
 _MOST = 3
 # Phases that are shaded.

@@ -26,7 +26,7 @@ from ccnn_torch.diagnosis.page.data import (
     signatures_of,
     used_rows,
 )
-from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, ON_SCREEN, cards, first_screen
+from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, ON_SCREEN, first_screen
 from ccnn_torch.diagnosis.page.tables import (
     aside_table,
     confusable_table,
@@ -34,7 +34,6 @@ from ccnn_torch.diagnosis.page.tables import (
     gap_table,
     next_table,
     order_table,
-    parameter_table,
     record_table,
     region_table,
     unseen_table,
@@ -125,10 +124,9 @@ def diagnosis_page(
     named = {figure.name: figure for figure in figures}
     machine = [named["machine"]] if "machine" in named else []
     answers = first_screen(results, about, ON_SCREEN if screen else ON_PAGE)
-    found = cards(results) if figures else []
-    # Cards have what is wrong and what to look at, tables what the lines have.
-    plain = [a if a.table is None else a._replace(commands=()) for a in answers]
-    beside = [a for a in plain if a.label not in ("What is wrong", "Look at")] if found else answers
+    if figures:
+        # Tables have what the lines have.
+        answers = [a if a.table is None else a._replace(commands=()) for a in answers]
     aside = results["rows_set_aside"]
     why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
     left_out = aside_text(aside, why, about.lines)
@@ -141,7 +139,7 @@ def diagnosis_page(
         kind="diagnosis of the gap",
         verdict="" if screen else verdict_text(results),
         sections=[
-            Section("What is wrong" if found else "", figures=machine, answers=beside, cards=found),
+            Section(figures=machine, answers=answers),
             *_sections(results, arrays, about, named, screen),
         ],
         facts=_facts(results, arrays, about),
@@ -180,8 +178,7 @@ def _notes(results: Block, about: About) -> list[str]:
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
-    from ccnn_torch.diagnosis.page.figure_rows import signature_plot
-    from ccnn_torch.diagnosis.page.figures import course_plot, gap_plot, probability_plot, remainder_map, where_plot
+    from ccnn_torch.diagnosis.page.figures import course_plot, remainder_map, signature_plot
     from ccnn_torch.report.machine import machine_plot
 
     effects = list(results["verdict"]["effects"])
@@ -190,11 +187,8 @@ def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[
     plots = (
         course_plot(results, arrays),
         machine_plot(arrays, f"With {words} in it" if found else "What is left"),
-        gap_plot(results),
-        probability_plot(results),
         signature_plot(signatures_of(arrays, labels, effects), arrays, effects),
         remainder_map(arrays, about),
-        where_plot(results, about),
     )
     return [plot for plot in plots if plot is not None]
 
@@ -205,13 +199,12 @@ def _sections(
     """The page in reading order; a section with nothing to show is left out."""
     order = order_table(results)
     effects = effect_table(results, least=_LEAST if screen else 0.0)
-    parameters = parameter_table(results, 12 if screen else 24)
     where = where_table(results, about, telling=screen)
     planned: list[tuple[str, tuple[str, ...], tuple[Table | None, ...]]] = [
-        ("How large is the gap?", ("gap",), (gap_table(results, about), order)),
-        ("Which effect?", ("probabilities",), (effects, parameters)),
+        ("How large is the gap?", (), (gap_table(results, about), order)),
+        ("Which effect?", (), (effects,)),
         ("What gives it away?", ("signatures",), ()),
-        ("Where is the gap?", ("map", "where", "course"), (where, region_table(results, about))),
+        ("Where is the gap?", ("map", "course"), (where, region_table(results, about))),
         ("Which effects do these rows not distinguish?", (), (confusable_table(results),)),
         ("What can these records not show?", (), (unseen_table(results), record_table(results))),
         ("What should be measured next?", (), (next_table(results, about),)),

@@ -20,12 +20,11 @@ from ccnn_torch.diagnosis.verdict.text import (
     probability_words,
     words_for,
 )
-from ccnn_torch.display import display_unit, number_text, own_unit, unit_text
+from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.files.write import write_rows
 from ccnn_torch.report.table import Table
 
 Block = Mapping[str, Any]
-_Z95 = 1.96
 _REMOVED = (
     "Removed: share of the mean square above the noise that goes on data not used for fitting; it is unknown (–) where "
     "the gap is not above the noise."
@@ -132,35 +131,6 @@ def order_table(results: Block) -> Table | None:
     return Table("How far does it shrink?", columns, rows, " ".join(n for n in notes if n))
 
 
-def parameter_table(results: Block, most: int = 24) -> Table | None:
-    """The parameters of the verdict's effects with their intervals.
-
-    Args:
-        most: so many are shown, those that are largest against their standard deviations.
-    """
-    rows, sizes = [], []
-    by_name = {e["name"]: e for e in results["effects"]}
-    for effect in results["verdict"]["effects"]:
-        for name, block in by_name.get(effect, {}).get("parameters", {}).items():
-            value, sd = block["value"], block["sd"]
-            scale, unit = own_unit(block) or display_unit(block["unit"], max(abs(value), sd or 0.0) or 1.0)
-            interval = "–" if sd is None else _interval(value, sd, scale)
-            numbers = (number_text(value / scale, 4), number_text(_over(sd, scale), 2), interval)
-            # Of a turning joint: whole numbers a turn.
-            unit = "times a turn" if name.endswith(" frequency") and block["unit"] == "1" else unit
-            rows.append((f"{effect}: {block.get('word') or name}", *numbers, unit))
-            sizes.append(abs(value) / sd if sd and not block.get("searched") else math.inf)
-    if not rows:
-        return None
-    columns = ("parameter", "value", "standard deviation", "95 % interval", "unit")
-    note = "Of the effects in the verdict, fitted together; the unit 1 is a number without unit."
-    if (hidden := len(rows) - most) > 0:
-        least = sorted(sizes, reverse=True)[most - 1]
-        rows = [row for row, size in zip(rows, sizes, strict=True) if size >= least]
-        note += f" The {hidden} that differ least from 0 are in diagnosis.json only."
-    return Table("How large is the effect?", columns, rows, note, ("unit",))
-
-
 def confusable_table(results: Block) -> Table | None:
     """Pairs of effects that these data do not distinguish, why, and which measurement would."""
     odds = {e["name"]: e["probability"] for e in results["effects"]}
@@ -232,11 +202,6 @@ def columns_text(columns: Sequence[str]) -> str:
 
 def _over(value: float | None, scale: float) -> float | None:
     return None if value is None else value / scale
-
-
-def _interval(value: float, sd: float, scale: float) -> str:
-    low, high = (number_text((value + side * _Z95 * sd) / scale, 3) for side in (-1, 1))
-    return f"{low} to {high}"
 
 
 _KELVIN = 273.15

@@ -3,21 +3,251 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE
+from ccnn_torch.diagnosis.candidates.atom import Atom, scales
+from ccnn_torch.diagnosis.residual.linearisation import signature_at
+from ccnn_torch.diagnosis.residual.rows import frame_columns
+from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, ROUNDING
 from ccnn_torch.diagnosis.result import effect_block, gap_block
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
-from ccnn_torch.diagnosis.verdict.fewest import fewest, together
-from ccnn_torch.diagnosis.verdict.intervals import spread_of
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
-from ccnn_torch.effects import Coefficient
-from ccnn_torch.evidence.shrink import Gap, HeldOut, draws, shrink_of
+from ccnn_torch.effects import Coefficient, Situation, moved
+from ccnn_torch.evidence.dictionary import FittedSet, covariance
+from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of, groups_of
+from ccnn_torch.evidence.shrink import FOLDS, Gap, HeldOut, draws, shrink_of
+
+
+def by_block(made: Blocks) -> dict[str, Any] | None:
+    """`by_block` of diagnosis.json; None where the verdict names nothing, or there are too few rows for blocks.
+
+    The names and their shapes (periods, lags) are those of all rows; their numbers, and frames that are not known, are
+    fitted to the rows outside of the block.
+
+    Args:
+        made: the diagnosis' held-out rows, its names and its draws.
+    """
+    analysis, judgement = made.analysis, made.judgement
+    atoms = analysis.atoms
+    members = [i for i in judgement.found.members if atoms[i].name in judgement.names]
+    white, keep = analysis.whitening, analysis.whitening.keep()
+    framed, fresh = white(analysis.fitted)[keep], white(frame_columns(analysis.situation, white.counted))[keep]
+    number = cut(analysis.situation.joints[keep], fresh)
+    if not members or not bool(torch.bincount(number, minlength=FOLDS).all()):
+        return None
+    columns = torch.cat([white(atoms[i].columns) for i in members], -1)[keep]
+    groups = groups_of(atoms[i].columns for i in members)
+    nominal, target = white(made.residual)[keep], white(analysis.residual)[keep]
+    before, left, uncertain = nominal.clone(), target.clone(), torch.zeros_like(target)
+    for k in range(FOLDS):
+        there = number == k
+        before[there] = nominal[there] - fresh[there] @ _frames(fresh[~there])(nominal[~there])
+        alone = _frames(framed[~there])
+        x, y = columns[~there], target[~there]
+        # Frames are as large as they have to be: what they can do is no evidence.
+        apart, rest = x - framed[~there] @ alone(x), y - framed[~there] @ alone(y)
+        fit = fit_sets(grams_of(apart, rest), [groups], analysis.dictionary.noise_dof)
+        mean = fit.mean[0]
+        frame = alone(y - x @ mean)
+        here = columns[there] - framed[there] @ alone(x)
+        left[there] = target[there] - columns[there] @ mean - framed[there] @ frame
+        uncertain[there] = ((here @ fit.covariance[0]) * here).sum(-1)
+    weight = white.weight[keep].sqrt()
+    held = HeldOut(left / weight * white.sigma, uncertain / weight.square() * white.sigma.square())
+    start = before / weight * white.sigma
+    gap = made.main(held, start)
+    channels = made.position if bool(made.position.any()) else ~made.position
+
+    def sizes(values: Tensor) -> list[float]:
+        squares = values[:, channels].square().sum(-1)
+        return [float(squares[number == k].mean().sqrt()) for k in range(FOLDS)]
+
+    return {
+        "unit": "m" if bool(made.position.any()) else "rad",
+        "before": gap.before,
+        "after": gap.after,
+        "noise_floor": gap.floor,
+        "shrink": gap.shrink,
+        "shrink_ci95": None if gap.interval is None else list(gap.interval),
+        "blocks": [
+            {"rows": int((number == k).sum()), "before": b, "after": a}
+            for k, (b, a) in enumerate(zip(sizes(start), sizes(held.left), strict=True))
+        ],
+    }
+
+
+def _frames(columns: Tensor) -> Callable[[Tensor], Tensor]:
+    """Least-squares coefficients of frames' columns `s x c x r` for values `s x c` or `s x c x m`: `r` or `r x m`."""
+    inverse = torch.linalg.pinv(columns.flatten(0, 1), rtol=ROUNDING)
+    return lambda values: inverse @ values.flatten(0, 1)
+
+
+def cut(joints: Tensor, frames: Tensor) -> Tensor:
+    """Number of each row's block along the direction in which the joints vary most, `s` int64.
+
+    Args:
+        joints: `s x n`; each counts in units of its spread.
+        frames: columns of the frames, `s x c x r`: rows with the same ones among them not zero share their frame.
+    """
+    centred = joints - joints.mean(0)
+    scaled = centred / centred.square().mean(0).sqrt().clamp_min(1e-12)
+    along = scaled @ torch.linalg.svd(scaled, full_matrices=False)[2][0]
+    # One column more that all rows have: there may be no frames at all.
+    theirs = torch.nn.functional.pad((frames != 0).any(1), (0, 1), value=True)
+    shared = torch.unique(theirs, dim=0, return_inverse=True)[1]
+    found = torch.empty_like(shared)
+    for group in shared.unique():
+        mine = torch.nonzero(shared == group).squeeze(-1)
+        order = mine[along[mine].argsort(stable=True)]
+        found[order] = torch.arange(len(mine)) * FOLDS // len(mine)
+    return found
+
+
+# Step of a derivative by a shape, as a share of its grid's narrowest step.
+_STEP = 1e-3
+
+
+class Spread(NamedTuple):
+    """Attributes:
+    coefficients: covariance, atom by atom, in units of their plausible sizes, `m x m`.
+    shapes: standard deviation of each shape that was searched between the values of its grid [SI], by the atom's place
+        in the set and the shape's number.
+    """
+
+    coefficients: Tensor
+    shapes: dict[tuple[int, int], float]
+
+
+def spread_of(analysis: Analysis, found: FittedSet) -> Spread:
+    """Covariance of the coefficients of a set, what is not known of its shapes included.
+
+    The model is linear in the coefficients for given shapes; about the shapes that were found it is taken as linear in
+    these, too (Laplace's approximation; MacKay 1992), with a normal prior as wide as their grids.
+    """
+    given = covariance(analysis.dictionary, found)
+    there = moved(analysis.situation, analysis.acting(found))
+    keys, columns, priors = [], [], []
+    for place, (i, mean) in enumerate(zip(found.members, found.mean, strict=True)):
+        atom = analysis.atoms[i]
+        for h, step in _free_shapes(analysis.situation, atom).items():
+            keys.append((place, h))
+            columns.append(_derivative(analysis.situation, there, atom, mean, h, step))
+            assert atom.effect is not None
+            grid = atom.effect.shapes(analysis.situation)[h].grid
+            priors.append(12 / (grid[-1] - grid[0]) ** 2)
+    if not keys:
+        return Spread(given, {})
+    (by_shape,) = analysis.whitened([torch.stack(columns, -1)])
+    index = torch.cat([analysis.dictionary.groups[i] for i in found.members])
+    own, by_shape = analysis.dictionary.columns[..., index].flatten(0, 1), by_shape.flatten(0, 1)
+    across = given @ (own.mT @ by_shape) / found.noise
+    precision = by_shape.mT @ by_shape / found.noise + torch.diag(by_shape.new_tensor(priors))
+    shapes = torch.linalg.inv(precision - (own.mT @ by_shape).mT @ across / found.noise)
+    deviations = shapes.diagonal().clamp_min(0).sqrt().tolist()
+    return Spread(given + across @ shapes @ across.mT, dict(zip(keys, deviations, strict=True)))
+
+
+def _free_shapes(situation: Situation, atom: Atom) -> dict[int, float]:
+    """Numbers of an atom's shapes of which values between those of the grid are possible, with a small step of each."""
+    if atom.effect is None:
+        return {}
+    used = None if atom.used is None else set(atom.used)
+    return {
+        h: _STEP * min(high - low for low, high in zip(shape.grid, shape.grid[1:], strict=False))
+        for h, shape in enumerate(atom.effect.shapes(situation))
+        if shape.refined and len(shape.grid) > 1 and (used is None or shape.columns is None or used & {*shape.columns})
+    }
+
+
+def _derivative(situation: Situation, there: Situation, atom: Atom, mean: Tensor, h: int, step: float) -> Tensor:
+    """Of what an atom does by one of its shapes, `s x c` [m or rad per SI unit of the shape]; within the grid."""
+    assert atom.effect is not None
+    grid = atom.effect.shapes(situation)[h].grid
+    size = scales(atom.effect.coefficients(situation), mean)
+    ends = []
+    for end in (max(float(atom.shape[h]) - step, grid[0]), min(float(atom.shape[h]) + step, grid[-1])):
+        shape = atom.shape.clone()
+        shape[h] = end
+        done = signature_at(situation, there, atom.effect, shape) @ (atom.spread(situation, mean) / size)
+        ends.append((end, torch.nan_to_num(done)))
+    (low, before), (high, after) = ends
+    change: Tensor = (after - before) / (high - low)
+    return change
+
+
+# Squares that are not seen in all rows together, in noise variances.
+_UNSEEN = 0.1
+# Times what a verdict leaves that a part of its numbers may leave.
+_KEPT = 1.2
+# Share by which the gains of numbers that do the same may differ.
+_TIE = 1e-6
+
+
+def fewest(gram: Tensor, mean: Tensor, spread: Tensor, noise: float) -> tuple[Tensor, Tensor]:
+    """Numbers of a model that do to the rows what all of them do, as few as can be found one by one.
+
+    Some numbers do the very same to all poses, as shifts along parallel axes do, and a fit spreads an error over them.
+
+    Args:
+        gram: inner products of what the numbers do, each by its plausible size, `m x m`.
+        mean, spread: the numbers as fitted, in plausible sizes, `m`, and their covariance, `m x m`.
+        noise: variance of one value.
+
+    Returns:
+        The numbers, `m`, 0 for those that are not needed; standard deviations, `m`, those of the fit for these.
+    """
+    deviation = spread.diagonal().clamp_min(0).sqrt()
+    target, chosen, found = gram @ mean, torch.zeros(len(mean), dtype=torch.bool), torch.zeros_like(mean)
+
+    def unseen(these: Tensor, values: Tensor) -> bool:
+        return float((values - these) @ gram @ (values - these)) <= _UNSEEN * noise
+
+    def solved(these: Tensor) -> Tensor:
+        values = torch.zeros_like(mean)
+        values[these] = torch.linalg.solve(gram[these][:, these], target[these])
+        return values
+
+    while not unseen(found, mean):
+        cross = gram[chosen]
+        free = gram.diagonal() - (cross * torch.linalg.solve(gram[chosen][:, chosen], cross)).sum(0)
+        gain = (target - gram @ found).square() / free
+        gain[chosen | (free <= _UNSEEN * noise)] = 0.0
+        if not bool((gain > 0).any()):
+            return mean, deviation
+        # Of numbers that do the same the first, whatever the rounding.
+        chosen[torch.nonzero(gain >= (1 - _TIE) * gain.max())[0]] = True
+        found = solved(chosen)
+    for i in torch.nonzero(chosen).squeeze(-1).tolist():
+        chosen[i] = False
+        if unseen(fewer := solved(chosen), mean):
+            found = fewer
+        else:
+            chosen[i] = True
+    # As well as they are known where the others are what the model has.
+    inner, cross = spread[~chosen][:, ~chosen], spread[~chosen]
+    known = spread.diagonal() - (cross * torch.linalg.solve(inner, cross)).sum(0)
+    return found, torch.where(chosen, known.clamp_min(0).sqrt(), deviation)
+
+
+def together(gram: Tensor, mean: Tensor, deviation: Tensor, left: float) -> int:
+    """How many of the clearest numbers have to be entered together to leave no more than 1.2 times what all leave.
+
+    Args:
+        gram, mean: as for `fewest`.
+        deviation: standard deviations, `m`, which say which numbers are the clearest.
+        left: squares that all of them leave.
+    """
+    gone = mean.clone()
+    for count, i in enumerate((mean.abs() / deviation).argsort(descending=True).tolist()):
+        if float(gone @ gram @ gone) <= (_KEPT**2 - 1) * left:
+            return count
+        gone[i] = 0.0
+    return len(mean)
 
 
 class Blocks:

@@ -87,6 +87,8 @@ def joined(parts: Sequence[Problem], shared: int) -> Problem:
     Raises:
         InputError: fewer equations than parameters.
     """
+    if len(parts) == 1:
+        return parts[0]
     first, width = parts[0], max(len(p.channels) for p in parts)
     counts = [p.weights.shape[-1] for p in parts]
     kinds = torch.cat([torch.full((1, n, 1), float(i), dtype=torch.float64) for i, n in enumerate(counts)], 1)

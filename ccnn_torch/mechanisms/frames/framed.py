@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.frames.around import Around
 from ccnn_torch.mechanisms.frames.fit import best_closed_form, rigid_body_frame, whole_rows
+from ccnn_torch.mechanisms.frames.partial import Around
 from ccnn_torch.mechanisms.machines.links import compose
 from ccnn_torch.mechanisms.machines.serial import FRAME
 from ccnn_torch.mechanisms.mechanism import Mechanism

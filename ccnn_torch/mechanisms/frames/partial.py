@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import Coordinate, Parameter
+from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.frames.around import Around
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative, nearest
 from ccnn_torch.mechanisms.pose import Frame, frame_gap
 from ccnn_torch.numerics.batching import expand_leading, leading_shape
+
+
+class Around(Mechanism):
+    """A mechanism that is another one, `mechanism`, seen or placed in some way."""
+
+    mechanism: Mechanism
+
+    def under(self, conditions: Mapping[str, Tensor]) -> Self:
+        """The mechanism inside under them."""
+        inner = self.mechanism.under(conditions)
+        if inner is self.mechanism:
+            return self
+        twin = copy.copy(self)
+        twin._modules = {**self._modules, "mechanism": inner}
+        return twin
+
+    def lacking(self, conditions: Sequence[str]) -> list[Condition]:
+        """As of the mechanism inside."""
+        return self.mechanism.lacking(conditions)
+
 
 _ROTATION_WEIGHT = 0.04
 

@@ -33,7 +33,6 @@ class Parameter(Result):
     """what people call it; empty where the name is the word"""
     shown: str = ""
     """the unit that they tell it in; empty = SI"""
-    sd_bootstrap: Number = None
 
 
 class PoseGap(Result):
