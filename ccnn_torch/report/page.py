@@ -35,6 +35,15 @@ class Answer(NamedTuple):
     table: Table | None = None
 
 
+class Card(NamedTuple):
+    """One thing that was found: its title, what it is, the numbers to enter, and what to look at."""
+
+    title: str
+    text: str
+    numbers: tuple[str, ...] = ()
+    look: str = ""
+
+
 @dataclass(frozen=True)
 class Section:
     """A part of a page; HTML has its title above its figures, its tables have their own."""
@@ -44,9 +53,10 @@ class Section:
     figures: Sequence[InlineFigure] = ()
     answers: Sequence[Answer] = ()
     sentences: Sequence[str] = ()
+    cards: Sequence[Card] = ()
 
     def show(self, console: Console, details: bool = True) -> None:
-        """Print it without figures, and without `details` the answers alone; no line to copy is wrapped."""
+        """Print it without figures and cards, and without `details` the answers alone; no line to copy is wrapped."""
         for answer in self.answers:
             print_labelled(answer.label, answer.text, console)
             for command in answer.commands:

@@ -8,7 +8,7 @@ import pytest
 from diagnosis_cases import CASES, indistinguishable, none, one_effect, outlier, outside, two_effects
 
 from ccnn_torch.diagnosis.page.data import About, about_of
-from ccnn_torch.diagnosis.page.first_screen import first_screen, numbers_table, where_words
+from ccnn_torch.diagnosis.page.first_screen import cards, first_screen, numbers_table, where_words
 from ccnn_torch.diagnosis.verdict.findings import findings, frequency_words, places, size_words
 from ccnn_torch.effects import EFFECTS, OUTLIER
 from ccnn_torch.effects.words import words_of
@@ -103,18 +103,21 @@ def test_the_numbers_to_enter_are_nominal_plus_error_with_their_digits() -> None
     assert numbers_table(_with("backlash", {"q1": (2e-7, 1e-6, "rad", "joint 1")}), 6) is None
 
 
-def test_lines_have_the_clearest_numbers_to_enter() -> None:
+def test_lines_and_cards_have_the_clearest_numbers_to_enter() -> None:
     parameters = {f"a{i}": (1e-3 * i, 1e-5, "m", f"link {i}", 0.1) for i in range(1, 6)}
     results = _with("geometry", parameters)
     enter = next(a for a in first_screen(results, About(folder="runs/d")) if a.label == "Enter instead")
     assert enter.commands[0] == "link 5 a5: 105.000 mm (off by 5.000 mm ± 20 µm)" and len(enter.commands) == 3
     assert enter.text == "all of these together, ± at 95 %; 2 more are in runs/d/report.html."
+    (card,) = cards(results)
+    assert card.title == "Geometry error" and card.numbers[:3] == enter.commands and card.look
     many = {f"a{i}": (1e-3 * i, 1e-5, "m", f"link {i}", 0.1) for i in range(1, 9)}
     results["effects"] = _with("geometry", many)["effects"]
     for block in results["effects"][0]["parameters"].values():
         block["together"] = 8
     enter = next(a for a in first_screen(results, About()) if a.label == "Enter instead")
     assert enter.text == "3 of 8 numbers, ± at 95 %; only all together repair the model: report.html."
+    assert [card.title for card in cards(outside()[0])][-1] == "What is left" and cards(none()[0]) == []
 
 
 def test_numbers_that_do_not_repair_the_model_are_not_to_be_entered() -> None:

@@ -31,7 +31,7 @@ from ccnn_torch.diagnosis.verdict.text import (
 from ccnn_torch.display import number_text, to_enter, unit_text
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
-from ccnn_torch.report.page import Answer
+from ccnn_torch.report.page import Answer, Card
 from ccnn_torch.report.table import Table
 
 Block = Mapping[str, Any]
@@ -63,6 +63,19 @@ def first_screen(results: Block, about: About, most: int = ON_PAGE) -> list[Answ
     if measure := _measure(results, about):
         said.append(Answer("Measure next", measure))
     return said
+
+
+def cards(results: Block) -> list[Card]:
+    """A card for each finding, with the clearest numbers of it; none where nothing is wrong."""
+    found, verdict = [], results["verdict"]
+    for finding in findings(results):
+        rows = _number_rows(results, finding.effect, _ON_A_CARD)[0]
+        lines = tuple(_line(row) for row in rows)
+        found.append(Card(capital(words_of(finding.effect).short), f"{capital(finding.text)}.", lines, finding.look))
+    if verdict["outside_library"] and not verdict["none"]:
+        text = f"A rest that {follows_words(verdict)}, which {no_effect_words(results)} describes."
+        found.append(Card("What is left", text))
+    return found
 
 
 def _enter(results: Block, table: Table, about: About) -> Answer:
@@ -276,8 +289,8 @@ def _regime(results: Block, about: About) -> str:
 _Z95 = 1.96
 # Of the middle from which a gain counts: a gain of some thousandths times the rest is no error.
 _MIDDLE_DIGITS = 6
-# Numbers of an effect, however many effects there are, and lines of the first screen.
-_FEWEST, _ON_LINES = 2, 3
+# Numbers of an effect, however many effects there are; lines of the first screen; and numbers of a card.
+_FEWEST, _ON_LINES, _ON_A_CARD = 2, 3, 4
 # A wave of forty periods over the travel, ten travels from where the joint counts from, is in step to a thousandth.
 _PERIOD_DIGITS = 7
 _OWN_UNIT = "A number without unit has that of the simulator."

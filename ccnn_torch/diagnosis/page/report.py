@@ -26,7 +26,7 @@ from ccnn_torch.diagnosis.page.data import (
     signatures_of,
     used_rows,
 )
-from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, ON_SCREEN, first_screen
+from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, ON_SCREEN, cards, first_screen
 from ccnn_torch.diagnosis.page.tables import (
     aside_table,
     confusable_table,
@@ -124,9 +124,11 @@ def diagnosis_page(
     named = {figure.name: figure for figure in figures}
     machine = [named["machine"]] if "machine" in named else []
     answers = first_screen(results, about, ON_SCREEN if screen else ON_PAGE)
+    found = cards(results) if figures else []
     if figures:
-        # Tables have what the lines have.
+        # Cards have what is wrong and what to look at, tables what the lines have.
         answers = [a if a.table is None else a._replace(commands=()) for a in answers]
+        answers = [a for a in answers if not found or a.label not in ("What is wrong", "Look at")]
     aside = results["rows_set_aside"]
     why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
     left_out = aside_text(aside, why, about.lines)
@@ -139,7 +141,7 @@ def diagnosis_page(
         kind="diagnosis of the gap",
         verdict="" if screen else verdict_text(results),
         sections=[
-            Section(figures=machine, answers=answers),
+            Section("What is wrong" if found else "", figures=machine, answers=answers, cards=found),
             *_sections(results, arrays, about, named, screen),
         ],
         facts=_facts(results, arrays, about),
