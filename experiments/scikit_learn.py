@@ -10,7 +10,7 @@ case = build_case("tripod")
 X = case.joints.numpy()  # q1, q2, q3 [m]
 y = (case.learnable + case.noise([0])[0]).numpy()  # deviation of each joint [m]
 
-folds = KFold(5, shuffle=True, random_state=0)
+folds = KFold(3, shuffle=True, random_state=0)
 for regressor in (DummyRegressor(), CCNNRegressor(), BPLMRegressor(), GRNNRegressor(), ENNRegressor()):
     error = -cross_val_score(regressor, X, y, cv=folds, scoring="neg_root_mean_squared_error").mean()
     print(f"{type(regressor).__name__}: {1e6 * error:.1f} µm held out")
