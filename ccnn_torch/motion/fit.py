@@ -4,7 +4,8 @@ noise with the form errors of effects and of the nominal model in it, under whic
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ _STEP = 1e-3
 _STEPS = 6
 # How often numbers at an end of what they may be are looked for in a step.
 _HELD = 3
-# Shares of a Gauss-Newton step that are tried, and what a step is damped by.
+# Shares of a Gauss-Newton step that are tried, the whole one first, and what a step is damped by.
 _SHARES = (1.0, 0.25)
 _DAMPING, _LESS, _MORE = 1e-3, 0.2, 10.0
 # Trials for each time that columns are simulated, and share of a promised gain from which columns still hold.
@@ -49,7 +50,6 @@ def fit_many(
     whitening: Whitening,
     specs: Sequence[tuple[int, Spec]],
     steps: int = _STEPS,
-    chosen: Tensor | None = None,
     nuisance: Tensor | None = None,
     reached: Tensor | None = None,
 ) -> list[Fit]:
@@ -59,22 +59,25 @@ def fit_many(
         problem: what is fitted.
         whitening: of the residual of each axis.
         specs: the axis and the set of each fit.
-        steps: Gauss-Newton steps.
-        chosen: stretches that count; all when None.
+        steps: how often columns are simulated at most.
         nuisance: whitened, what the nominal values of each axis may be off by, `n x k x v`; nothing when None.
         reached: squares that the best set of each axis leaves, whitened, `n`: of sets that come nowhere near, columns
             are simulated half as often. None = no set is known.
     """
-    judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
     found: list[Fit] = []
-    lot: list[tuple[int, Spec]] = []
-    for k, (axis, spec) in enumerate(specs):
-        lot.append((axis, spec))
-        simulated = sum(len(one.moved) + 2 for _, one in lot) * judged.numel()
-        if simulated > _VALUES or k == len(specs) - 1:
-            found += _fit_lot(problem, whitening, lot, steps, chosen, nuisance, reached)
-            lot = []
+    for lot in _lots(problem, specs):
+        found += _fit_lot(problem, whitening, lot, steps, nuisance, reached)
     return found
+
+
+def _lots(problem: Problem, specs: Sequence[tuple[int, Spec]]) -> Iterator[Sequence[tuple[int, Spec]]]:
+    """Sets, one lot after the other, that are simulated at a time."""
+    first, simulated = 0, 0
+    for k, (_, spec) in enumerate(specs):
+        simulated += (len(spec.moved) + 2) * problem.data.judged.numel()
+        if simulated > _VALUES or k == len(specs) - 1:
+            yield specs[first : k + 1]
+            first, simulated = k + 1, 0
 
 
 def sensitivities(
@@ -125,105 +128,171 @@ def _columns(
     return columns
 
 
+def refitted(
+    problem: Problem, whitening: Whitening, specs: Sequence[tuple[int, Spec]], parts: Sequence[Tensor]
+) -> list[Tensor]:
+    """Numbers of sets as some stretches alone tell them, `p x k` for each part, from the numbers that all tell.
+
+    Args:
+        problem, whitening, specs: as of `fit_many`.
+        parts: stretches of each.
+    """
+    found: list[list[Tensor]] = [[] for _ in parts]
+    for lot in _lots(problem, specs):
+        axis, places = torch.tensor([i for i, _ in lot]), [s.moved for _, s in lot]
+        theta = torch.stack([s.theta for _, s in lot])
+        both = sensitivities(problem, whitening, theta, axis, places)
+        for own, rows in zip(found, parts, strict=True):
+            begin = _Point(theta, *(v.unflatten(-1, (len(problem.judged), -1))[..., rows, :].flatten(-2) for v in both))
+            values, goal = float(problem.judged[rows].sum()), torch.full_like(theta[:, 0], math.inf)
+            own.append(_descended(problem, whitening, begin, axis, places, 1, values, goal, rows)[0].theta)
+    return [torch.cat(own) for own in found]
+
+
 def _fit_lot(
     problem: Problem,
     whitening: Whitening,
     specs: Sequence[tuple[int, Spec]],
     steps: int,
-    chosen: Tensor | None,
     nuisance: Tensor | None,
     reached: Tensor | None,
 ) -> list[Fit]:
-    axis = torch.tensor([i for i, _ in specs])
+    axis, places = torch.tensor([i for i, _ in specs]), [s.moved for _, s in specs]
     theta = torch.stack([s.theta for _, s in specs])
-    places = [s.moved for _, s in specs]
-    judged = problem.judged if chosen is None else problem.judged[chosen]
+    judged = problem.judged
     values = float(judged.sum())
     goal = torch.full_like(theta[:, 0], math.inf) if reached is None else _NEAR * reached[axis]
-    theta, residual, columns = _descended(problem, whitening, theta, axis, places, steps, values, chosen, goal)
+    begin = _Point(theta, *sensitivities(problem, whitening, theta, axis, places))
+    point, is_exact, settled = _descended(problem, whitening, begin, axis, places, steps, values, goal)
+    _renew(problem, whitening, point, axis, places, (~is_exact).nonzero()[:, 0])
     # Here, since the whitened residual does not tell it.
-    plain = problem.pooled(problem.residual(theta, axis, chosen))
+    plain = problem.pooled(problem.residual(point.theta, axis))
     left = (plain.square() * judged).sum((-1, -2)) / values
-    folds = [
-        (own if chosen is None else own[chosen])[:, None].expand(judged.shape).flatten()
-        for own in (problem.fold, problem.part)
-    ]
-    ended = [spec._replace(theta=now) for (_, spec), now in zip(specs, theta, strict=True)]
-    beside = residual.new_zeros(len(specs), 0, residual.shape[1]) if nuisance is None else nuisance[axis]
-    return _fits_of(ended, residual, columns, values, left.tolist(), folds, beside)
+    folds = [own[:, None].expand(judged.shape).flatten() for own in (problem.fold, problem.part)]
+    ended = [spec._replace(theta=now) for (_, spec), now in zip(specs, point.theta, strict=True)]
+    beside = theta.new_zeros(len(specs), 0, point.residual.shape[1]) if nuisance is None else nuisance[axis]
+    found = _fits_of(ended, point.residual, point.columns, values, left.tolist(), folds, beside)
+    return [fit._replace(settled=end) for fit, end in zip(found, settled.tolist(), strict=True)]
+
+
+class _Point(NamedTuple):
+    """Numbers of sets, `p x k`, with residuals and columns there, as of `sensitivities`."""
+
+    theta: Tensor
+    residual: Tensor
+    columns: Tensor
+
+
+def _renew(
+    problem: Problem,
+    whitening: Whitening,
+    point: _Point,
+    axis: Tensor,
+    places: Sequence[Sequence[int]],
+    those: Tensor,
+    chosen: Tensor | None = None,
+) -> None:
+    """Simulate the columns of some rows where they are now."""
+    if len(those):
+        own = [places[k] for k in those.tolist()]
+        new = _columns(problem, whitening, point.theta[those], axis[those], own, point.residual[those], chosen)
+        point.columns[those, : new.shape[1]] = new
 
 
 def _descended(
     problem: Problem,
     whitening: Whitening,
-    theta: Tensor,
+    begin: _Point,
     axis: Tensor,
     places: Sequence[Sequence[int]],
     steps: int,
     values: float,
-    chosen: Tensor | None,
     goal: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Numbers where Gauss-Newton steps end, with residuals and columns there, as of `sensitivities`.
+    chosen: Tensor | None = None,
+) -> tuple[_Point, Tensor, Tensor]:
+    """Where Gauss-Newton steps end, whether columns are those of there, and whether no step leads further, `p` each.
 
     From step to step columns follow what the residuals do (Broyden 1965), and are simulated anew where that promised
     another gain than there was, or none.
     """
-    theta = theta.clone()
-    residual, columns = sensitivities(problem, whitening, theta, axis, places, chosen)
+    point = _Point(*(v.clone() for v in begin))
+    theta, residual, columns = point
     active, real = _padded(places)
-    low, high = (bound[axis].gather(-1, active) for bound in problem.library.bounds)
+    bounds = [bound[axis].gather(-1, active) for bound in problem.library.bounds]
     damping = torch.full((len(theta),), _DAMPING, dtype=theta.dtype)
-    made, is_exact = torch.zeros(len(theta)), torch.ones(len(theta), dtype=torch.bool)
+    made, is_exact = torch.ones(len(theta)), torch.ones(len(theta), dtype=torch.bool)
+    settled = torch.zeros_like(is_exact)
     run = torch.tensor([k for k, own in enumerate(places) if own and steps], dtype=torch.int64)
 
-    def renew(those: Tensor) -> None:
-        own = [places[k] for k in those.tolist()]
-        new = _columns(problem, whitening, theta[those], axis[those], own, residual[those], chosen)
-        columns[those, : new.shape[1]] = new
+    def white(theta: Tensor, those: Tensor) -> Tensor:
+        return _white(problem, whitening, theta, axis[those], chosen)
 
     for _ in range(_TRIALS * steps):
         if not len(run):
             break
         x, y, own, at = columns[run], residual[run], theta[run].gather(-1, active[run]), theta[run]
-        ends = ((low[run] - own) * real[run], (high[run] - own) * real[run])
-        move = _step(x, y, own * real[run], ends, damping[run], values)
+        low, high = ((bound[run] - own) * real[run] for bound in bounds)
+        move = _step(x, y, own * real[run], (low, high), damping[run], values)
         cost = _cost(y, at, values)
         least = _cost(y - (move[:, None] @ x)[:, 0], at.scatter_add(-1, active[run], move), values)
-        promised, best, share_of = cost - least, cost.clone(), torch.zeros_like(cost)
-        for share in _SHARES:
-            # A shorter step, too, where columns are those of where it begins, or the whole one was none.
-            those = ((promised >= _GAINED * values) & (is_exact[run] | (best >= cost))).nonzero()[:, 0]
-            if not len(those):
-                break
-            here = run[those]
-            tried = at[those].scatter_add(-1, active[here], share * move[those])
-            white = _white(problem, whitening, tried, axis[here], chosen)
-            reached = _cost(white, tried, values)
-            better = reached < best[those]
-            best[those[better]], share_of[those[better]] = reached[better], share
-            theta[here[better]], residual[here[better]] = tried[better], white[better]
-        gained = cost - best
+        promised = cost - least
+        share, gained = _tried(white, theta, residual, run, active[run], move, promised >= _GAINED * values, values)
         good = (gained > 0).nonzero()[:, 0]
-        step = (share_of[:, None] * move)[good]
+        step = (share[:, None] * move)[good]
         surprise = y[good] - residual[run[good]] - (step[:, None] @ x[good])[:, 0]
         columns[run[good]] += (step / step.square().sum(-1, keepdim=True))[..., None] * surprise[:, None]
         is_exact[run[good]] = False
-        damping[run] *= torch.where(share_of == 1, _LESS, 1.0)
+        damping[run] *= torch.where(share == 1, _LESS, 1.0)
         poor = gained < torch.maximum(_AS_PROMISED * promised, promised.new_tensor(_GAINED * values))
         stale = poor & ~is_exact[run]
-        damping[run] *= torch.where((share_of < 1) & ~(stale & (share_of == 0)), _MORE, 1.0)
-        anew = run[stale]
-        if len(anew):
-            renew(anew)
-            made[anew], is_exact[anew] = made[anew] + 1, True
-        ended = is_exact[run] & ~stale & ((promised < _GAINED * values) | (damping[run] >= _STIFF))
+        damping[run] *= torch.where((share < 1) & ~(stale & (share == 0)), _MORE, 1.0)
+        ended = is_exact[run] & ((promised < _GAINED * values) | (damping[run] >= _STIFF))
+        settled[run[ended]] = True
         most = torch.where(residual[run].square().sum(-1) <= goal[run], steps, math.ceil(_FAR * steps))
-        run = run[~ended & (made[run] < most)]
-    anew = (~is_exact).nonzero()[:, 0]
-    if len(anew):
-        renew(anew)
-    return theta, residual, columns
+        ended |= stale & (made[run] >= most)
+        anew = run[stale & ~ended]
+        _renew(problem, whitening, point, axis, places, anew, chosen)
+        made[anew], is_exact[anew] = made[anew] + 1, True
+        run = run[~ended]
+    return point, is_exact, settled
+
+
+def _tried(
+    white: Callable[[Tensor, Tensor], Tensor],
+    theta: Tensor,
+    residual: Tensor,
+    run: Tensor,
+    active: Tensor,
+    move: Tensor,
+    promising: Tensor,
+    values: float,
+) -> tuple[Tensor, Tensor]:
+    """Take the best share of each step that leaves less, in `theta` and `residual`, all shares simulated at once.
+
+    Args:
+        white: whitened residuals of numbers `p x k` of the rows `p`.
+        theta, residual: of all rows.
+        run, active: the rows that step, `r`, and places of their numbers, `r x m`.
+        move: their steps, `r x m`.
+        promising: which of these are tried, `r`.
+        values: how many count.
+
+    Returns:
+        the shares, 0 where no one leaves less, and the half deviance that each gained, `r` each.
+    """
+    share, gained = torch.zeros_like(move[:, 0]), torch.zeros_like(move[:, 0])
+    those = promising.nonzero()[:, 0]
+    if not len(those):
+        return share, gained
+    here, shares = run[those], move.new_tensor(_SHARES)
+    moved = theta[here].expand(len(shares), -1, -1)
+    moved = moved.scatter_add(-1, active[those].expand(len(shares), -1, -1), shares[:, None, None] * move[those])
+    left = white(moved.flatten(0, 1), here.repeat(len(shares))).unflatten(0, (len(shares), -1))
+    gain, best = (_cost(residual[here], theta[here], values) - _cost(left, moved, values)).max(0)
+    better = (gain > 0).nonzero()[:, 0]
+    share[those[better]], gained[those[better]] = shares[best[better]], gain[better]
+    theta[here[better]], residual[here[better]] = moved[best[better], better], left[best[better], better]
+    return share, gained
 
 
 def _padded(places: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
@@ -311,6 +380,7 @@ def _fits_of(
             once[k],
             left[k],
             Grams(grams.xx[k][at[:, None], at], grams.xy[k, at], grams.yy[k], values),
+            False,
         )
         for k, (spec, evidence, at) in enumerate(zip(specs, found.log_evidence.tolist(), kept, strict=True))
     ]
@@ -354,7 +424,7 @@ def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Sequence[Te
 
 
 def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:
-    """Half the deviance, `p`; residual `p x v`, theta `p x k`."""
+    """Half the deviance, `...`; residual `... x v`, theta `... x k`."""
     rss = residual.square().sum(-1)
     return 0.5 * values * torch.log(rss.clamp_min(1e-300)) + 0.5 * theta.square().sum(-1) / WIDE**2
 
@@ -410,20 +480,24 @@ def evidences(models: Sequence[tuple[Grams, Sequence[Tensor]]], variance: float)
         models: inner products as `weighed` takes them, and the groups of the columns that are fitted.
         variance: of the noise.
     """
-    apart = [_under_noise(grams, sum(map(len, groups)), variance) for grams, groups in models]
-    widest = max(len(own.xy) for own in apart)
+    apart = side_by_side([_under_noise(grams, sum(map(len, groups)), variance) for grams, groups in models])
+    found: list[float] = fit_sets(apart, [groups for _, groups in models], CERTAIN * apart.values).log_evidence.tolist()
+    return found
+
+
+def side_by_side(models: Sequence[Grams]) -> Grams:
+    """Inner products of `p` models as those of one batch, padded with 0 to the widest."""
+    widest = max(len(own.xy) for own in models)
 
     def wide(values: Tensor) -> Tensor:
         return torch.nn.functional.pad(values, (0, widest - values.shape[-1]) * values.dim())
 
-    grams = Grams(
-        torch.stack([wide(own.xx) for own in apart]),
-        torch.stack([wide(own.xy) for own in apart]),
-        torch.stack([own.yy for own in apart]),
-        apart[0].values,
+    return Grams(
+        torch.stack([wide(own.xx) for own in models]),
+        torch.stack([wide(own.xy) for own in models]),
+        torch.stack([own.yy for own in models]),
+        models[0].values,
     )
-    found: list[float] = fit_sets(grams, [groups for _, groups in models], CERTAIN * grams.values).log_evidence.tolist()
-    return found
 
 
 def _under_noise(grams: Grams, columns: int, variance: float) -> Grams:
@@ -437,15 +511,21 @@ def _under_noise(grams: Grams, columns: int, variance: float) -> Grams:
     )
 
 
-def deviations(fit: Fit, variance: float) -> Tensor:
-    """Standard deviations of a set's numbers, `m` in plausible sizes, under a noise that holds form errors as well.
+def deviations(fits: Sequence[Fit], variances: Sequence[float]) -> list[Tensor]:
+    """Standard deviations of the numbers of sets, `m` in plausible sizes each, under noises that hold form errors too.
 
     The values of the nominal model are taken for exact here.
     """
-    m, grams = len(fit.spec.flat), fit.grams
-    own = grams._replace(xx=grams.xx[:m, :m], xy=grams.xy[:m])
-    found = weighed(own, [fit.spec.groups], m, max(variance, fit.noise))
-    return found.covariance[0, :m, :m].diagonal().clamp_min(0).sqrt()
+    if not fits:
+        return []
+    own = []
+    for fit, variance in zip(fits, variances, strict=True):
+        m = len(fit.spec.flat)
+        grams = fit.grams._replace(xx=fit.grams.xx[:m, :m], xy=fit.grams.xy[:m])
+        own.append(scaled(grams, max(variance, fit.noise)))
+    found = fit_sets(side_by_side(own), [fit.spec.groups for fit in fits], CERTAIN * own[0].values)
+    spread = found.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    return [sd[: len(fit.spec.flat)] for sd, fit in zip(spread, fits, strict=True)]
 
 
 def unseen_errors(found: Sequence[Sequence[Fit]]) -> list[float]:

@@ -27,8 +27,8 @@ _BEAM, _FITTED, _MOST = 2, 4, 9
 _DIGITS = 3
 # Log posterior that a level must bring.
 _GAINED = 1.0
-# Stretches in which sets are looked for.
-_SCREENED = 16
+# Stretches in which sets are looked for, at first and then.
+_FIRST, _SCREENED = 8, 16
 # Sets that are fitted anew under another noise; and to all stretches, with log posteriors within so much.
 _KEPT, _LIKELY, _WITHIN = 6, 16, 30.0
 _LONG, _SHORT, _FEW = 8, 5, 3
@@ -69,11 +69,14 @@ def search(problem: Problem) -> Search:
     """Find the probable sets of every axis."""
     n, count = len(problem.followed), len(problem.data.run)
     # Sets are looked for in some of the stretches, and fitted to all.
-    few = problem.of(torch.linspace(0, count - 1, _SCREENED).round().long()) if count > _SCREENED else problem
-    plain = _Pool(few, white_noise(n))
+    fewest, few = (
+        problem.of(torch.linspace(0, count - 1, some).round().long()) if count > some else problem
+        for some in (_FIRST, _SCREENED)
+    )
+    plain = _Pool(fewest, white_noise(n))
     plain.forward()
     largest = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
-    pool = _Pool(few, fitted_whitening(problem.pooled(largest), problem.judged))
+    pool = _Pool(fewest, fitted_whitening(problem.pooled(largest), problem.judged))
     pool.again(plain)
     pool.forward()
     # The noise of what is left by what is most probable now.
@@ -153,8 +156,10 @@ class _Pool:
         return sorted(found, key=lambda one: (-_level(one[0]), one[1].members))
 
     def fit(self, wanted: Sequence[Sequence[Spec]], steps: int) -> None:
-        """Fit sets of each axis; one that was fitted before stays if it was better."""
-        pairs = [(i, spec) for i, own in enumerate(wanted) for spec in own]
+        """Fit sets of each axis; one that was fitted before stays if it was better, and is left alone where that
+        fit has come to rest."""
+        settled = [{id(fit.spec) for fit in own.values() if fit.settled} for own in self.found]
+        pairs = [(i, spec) for i, own in enumerate(wanted) for spec in own if id(spec) not in settled[i]]
         best = [min((f.rss for f in own.values()), default=math.inf) for own in self.found]
         reached = torch.tensor(best, dtype=torch.float64)
         fits = fit_many(self.problem, self.whitening, pairs, steps, nuisance=self.nuisance, reached=reached)
@@ -195,13 +200,13 @@ class _Pool:
 
     def explored(self) -> list[list[Spec]]:
         """The likely sets of each axis, and every effect alone: sets near those that are the most probable."""
-        self.neighbours()
-        if self.twins():
-            self.neighbours()
         self.reduced()
         likely = self.likely()
         # Sets that are probable although forms are wrong are smaller than those above.
         self.weigh_forms()
+        self.neighbours()
+        if self.twins():
+            self.neighbours()
         self.forward()
         self.neighbours()
         for own, more, found in zip(likely, self.likely(), self.found, strict=True):
@@ -276,9 +281,12 @@ class _Pool:
         """
         old = self.found if old is None else old
         wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
-        for i, fit in [(i, fit) for i, own in enumerate(bases) for fit in own]:
+        pairs = [(i, fit) for i, own in enumerate(bases) for fit in own]
+        variances = [self.noise_of(i) for i, _ in pairs]
+        promised = promises(self.problem, self.whitening, pairs, self.nuisance, variances)
+        for (i, fit), found in zip(pairs, promised, strict=True):
             scores: dict[int, tuple[float, Variant]] = {}
-            for score, variant in promise(self.problem, self.whitening, i, fit, self.nuisance[i], self.noise_of(i)):
+            for score, variant in found:
                 if variant.effect not in scores or _level(score) > _level(scores[variant.effect][0]):
                     scores[variant.effect] = (score, variant)
             ranked = (v for _, v in sorted(scores.values(), key=lambda item: (-_level(item[0]), item[1].effect)))
@@ -313,44 +321,58 @@ def with_gain(library: Library, axis: int, spec: Spec) -> Spec | None:
     return other
 
 
-def promise(
-    problem: Problem, whitening: Whitening, i: int, base: Fit, nuisance: Tensor, variance: float | None
-) -> list[tuple[float, Variant]]:
+def promises(
+    problem: Problem,
+    whitening: Whitening,
+    bases: Sequence[tuple[int, Fit]],
+    nuisance: Tensor,
+    variances: Sequence[float | None],
+) -> list[list[tuple[float, Variant]]]:
     """For every variant of an effect that an axis can show and a set lacks, the evidence of both together.
 
     Args:
         problem: the data.
         whitening: of the residual.
-        i: the axis.
-        base: its set.
-        nuisance: as of `fit_many`, of this axis.
-        variance: of noise and form errors; None: the noise that each set leaves.
+        bases: axis and set of each.
+        nuisance: as of `fit_many`.
+        variances: for each base, of noise and form errors; None: the noise that each set leaves.
     """
-    library, theta, flat = problem.library, base.spec.theta, list(base.spec.flat)
+    library = problem.library
     variants = [
-        v for own in library.variants for v in own if v.effect not in base.members and bool(library.there[i, v.effect])
+        [v for own in library.variants for v in own if v.effect not in fit.members and bool(library.there[i, v.effect])]
+        for i, fit in bases
     ]
-    if not variants:
+    if not bases:
         return []
-    moved, steps = [], []
-    for v in variants:
-        for a, j in enumerate(v.active):
-            changed, value = theta.clone(), float(v.values[i, a])
+    axis, theta = torch.tensor([i for i, _ in bases]), torch.stack([fit.spec.theta for _, fit in bases])
+    residual, own = sensitivities(problem, whitening, theta, axis, [fit.spec.flat for _, fit in bases])
+    # A row for every number of every variant.
+    rows, moved, steps = [], [], []
+    for b, (i, fit) in enumerate(bases):
+        for variant, a, j in ((v, a, j) for v in variants[b] for a, j in enumerate(v.active)):
+            changed, value = fit.spec.theta.clone(), float(variant.values[i, a])
             steps.append(value if abs(value) > 1e-6 else _STEP)
             changed[j] += steps[-1]
-            changed[list(v.held)] = v.shapes[i]
+            changed[list(variant.held)] = variant.shapes[i]
             moved.append(changed)
-    residual, own = sensitivities(problem, whitening, theta[None], torch.tensor([i]), [flat])
-    axis = torch.full((len(moved),), i)
-    left = problem.whitened(problem.residual(torch.stack(moved), axis), axis, whitening)
-    new = (residual - left) / left.new_tensor(steps)[:, None]
-    x = torch.cat([own[0], new])
-    y = residual[0] + theta[flat] @ own[0]
-    grams = products(x, nuisance, y, float(problem.judged.sum()))
-    ends = torch.tensor([len(v.active) for v in variants]).cumsum(0) + len(flat)
-    sets = [
-        [*base.spec.groups, torch.arange(int(end) - len(v.active), int(end))]
-        for v, end in zip(variants, ends, strict=True)
-    ]
-    scores = weighed(grams, sets, len(x), variance).log_evidence.tolist()
-    return [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, variants, strict=True)]
+            rows.append(b)
+    if not moved:
+        return [[] for _ in bases]
+    at = torch.tensor(rows)
+    left = problem.whitened(problem.residual(torch.stack(moved), axis[at]), axis[at], whitening)
+    new = (residual[at] - left) / left.new_tensor(steps)[:, None]
+    found = []
+    for b, (i, fit) in enumerate(bases):
+        flat = list(fit.spec.flat)
+        x = torch.cat([own[b, : len(flat)], new[at == b]])
+        grams = products(x, nuisance[i], residual[b] + theta[b, flat] @ x[: len(flat)], float(problem.judged.sum()))
+        widths = torch.tensor([len(v.active) for v in variants[b]], dtype=torch.int64)
+        ends = (widths.cumsum(0) + len(flat)).tolist()
+        sets = [
+            [*fit.spec.groups, torch.arange(end - len(v.active), end)] for v, end in zip(variants[b], ends, strict=True)
+        ]
+        scores = weighed(grams, sets, len(x), variances[b]).log_evidence.tolist() if sets else []
+        found.append(
+            [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, variants[b], strict=True)]
+        )
+    return found
