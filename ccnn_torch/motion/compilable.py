@@ -42,9 +42,7 @@ def loop(function: F) -> F:
     # Numba looks at the file of the function alone, not at those of what it calls, which are imported before it.
     sources = b"".join(Path(path).read_bytes() for path in sorted({*_SOURCES, function.__code__.co_filename}))
     function.__qualname__ += f"_{zlib.crc32(sources):08x}"
-    # Courses are finite: what runs away is held, so that no step needs to ask for NaN.
-    free = {"nnan", "nsz", "contract", "arcp"}
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=free)(function))
+    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
 def pick(which: Any, a: Any, b: Any) -> Any:

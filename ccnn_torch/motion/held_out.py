@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.shrink import Draws, Gap, HeldOut, shrink_of
-from ccnn_torch.motion.fit import refitted
+from ccnn_torch.motion.descent import refitted
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
-from ccnn_torch.motion.spec import Spec, without
+from ccnn_torch.motion.spec import Spec, nothing, without
 from ccnn_torch.motion.whiten import Whitening
 
 
@@ -64,10 +64,9 @@ def only(library: Library, spec: Spec, members: Sequence[int]) -> Spec:
 def singles(found: Search) -> dict[str, list[Spec]]:
     """Of each effect alone its fit on every axis; an axis that cannot show it has none."""
     library = found.problem.library
-    none = Spec((), torch.zeros(library.size, dtype=torch.float64), (), 0.0)
     alone = [{f.members[0]: f.spec for f in fits if len(f.members) == 1} for fits in found.found]
     return {
-        name: [own.get(e, none) for own in alone]
+        name: [own.get(e, nothing(library)) for own in alone]
         for e, name in enumerate(library.names)
         if any(e in own for own in alone)
     }

@@ -21,7 +21,8 @@ from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.evidence.judge import judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets
 from ccnn_torch.evidence.priors import OUTSIDE, crowd
-from ccnn_torch.motion.fit import evidences, products, sensitivities, side_by_side, squares_unseen
+from ccnn_torch.motion.descent import sensitivities
+from ccnn_torch.motion.fit import evidences, products, side_by_side, squares_unseen
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, log_posterior
 from ccnn_torch.motion.spec import Fit, Spec

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.motion.fit import sensitivities
+from ccnn_torch.motion.descent import sensitivities
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem

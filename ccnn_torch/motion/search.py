@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.priors import EFFECT, crowd
-from ccnn_torch.motion.fit import evidences, fit_many, form_errors, products, sensitivities, unseen_errors, weighed
+from ccnn_torch.motion.descent import sensitivities
+from ccnn_torch.motion.fit import evidences, fit_many, form_errors, products, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.servo import TORQUES
-from ccnn_torch.motion.spec import Fit, Spec, started, without
+from ccnn_torch.motion.spec import Fit, Spec, nothing, started, without
 from ccnn_torch.motion.whiten import Whitening, fitted_whitening, white_noise
 
 # Sets that are extended, effects that are fitted for each of them after the screen, and members at most.
@@ -74,7 +75,8 @@ def search(problem: Problem) -> Search:
         for some in (_FIRST, _SCREENED)
     )
     plain = _Pool(fewest, white_noise(n))
-    plain.forward()
+    # What is left is all that this is for.
+    plain.forward(1, _FEW)
     largest = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
     pool = _Pool(fewest, fitted_whitening(problem.pooled(largest), problem.judged))
     pool.again(plain)
@@ -115,12 +117,11 @@ class _Pool:
         white = problem.whitened(nuisance.flatten(0, 1), problem.axes.repeat(len(nuisance)), whitening)
         self.nuisance = white.reshape(len(nuisance), self.axes, white.shape[-1]).transpose(0, 1)
         self.library: Library = problem.library
-        zero = torch.zeros(self.library.size, dtype=torch.float64)
         # Of noise and form errors of each axis; None: the noise that each set leaves.
         self.variance: list[float] | None = None
         self.scores: list[dict[tuple[float, Members], tuple[float, Fit]]] = [{} for _ in range(self.axes)]
         self.found: list[dict[tuple[int, ...], Fit]] = [{} for _ in range(self.axes)]
-        self.fit([[Spec((), zero, (), 0.0)] for _ in range(self.axes)], 0)
+        self.fit([[nothing(self.library)] for _ in range(self.axes)], 0)
 
     def best(self) -> list[Fit]:
         return [self.scored(i)[0][1] for i in range(self.axes)]
@@ -174,25 +175,23 @@ class _Pool:
         self.fit([[f.spec for f in fits[:_KEPT] if len(f.members) > 1] for fits in ranked], _LONG)
         self.fit([[f.spec for f in fits if len(f.members) == 1] for fits in ranked], _FEW)
 
-    def forward(self) -> None:
-        """Add effects one after the other, as long as that brings evidence."""
+    def forward(self, beam: int = _BEAM, steps: int = _SHORT) -> None:
+        """Add effects one after the other to the `beam` most probable sets, as long as that brings evidence."""
         done: list[set[tuple[int, ...]]] = [set() for _ in range(self.axes)]
         gains = [True] * self.axes
         for _ in range(_MOST):
             before = [self.scored(i)[0][0] for i in range(self.axes)]
             bases = [
-                [f for f in self.leading(i) if gains[i] and f.members not in done[i] and len(f.members) < _MOST]
+                [f for f in self.leading(i)[:beam] if gains[i] and f.members not in done[i] and len(f.members) < _MOST]
                 for i in range(self.axes)
             ]
             for d, own in zip(done, bases, strict=True):
                 d |= {f.members for f in own}
             # Alone every effect is fitted: its own share of the gap is told.
             alone = all(not f.members for own in bases for f in own)
-            self.fit(self.screened(bases, len(self.library.names) if alone else _FITTED), _SHORT)
-            self.fit(
-                [[f.spec for f in self.leading(i) if f.members and own] for i, own in enumerate(bases)],
-                _SHORT,
-            )
+            self.fit(self.screened(bases, len(self.library.names) if alone else _FITTED), steps)
+            leading = [self.leading(i)[:beam] if own else [] for i, own in enumerate(bases)]
+            self.fit([[f.spec for f in own if f.members] for own in leading], steps)
             after = [self.scored(i)[0][0] for i in range(self.axes)]
             gains = [a >= b + _GAINED for a, b in zip(after, before, strict=True)]
             if not any(gains):
@@ -204,11 +203,11 @@ class _Pool:
         likely = self.likely()
         # Sets that are probable although forms are wrong are smaller than those above.
         self.weigh_forms()
-        self.neighbours()
-        if self.twins():
-            self.neighbours()
-        self.forward()
-        self.neighbours()
+        self.neighbours([True] * self.axes)
+        for extend in (self.twins, self.forward):
+            before = self.best()
+            extend()
+            self.neighbours([a.members != b.members for a, b in zip(before, self.best(), strict=True)])
         for own, more, found in zip(likely, self.likely(), self.found, strict=True):
             own |= more | {members: fit.spec for members, fit in found.items() if len(members) == 1}
         self.variance = None
@@ -230,31 +229,33 @@ class _Pool:
             self.variance = [own[0].noise + more for own, more in zip(ranked, form, strict=True)]
         return unseen
 
-    def neighbours(self) -> None:
-        """The most probable set without each of its members, and with another effect in the place of each."""
+    def neighbours(self, going: list[bool]) -> None:
+        """The most probable set without each of its members, and with another effect in the place of each, of some
+        axes."""
         for _ in range(3):
+            if not any(going):
+                return
             before = self.best()
-            self.fit(self.screened(self.fewer([f.spec for f in before], _SHORT)), _SHORT)
+            now = [f.spec if on else nothing(self.library) for f, on in zip(before, going, strict=True)]
+            self.fit(self.screened(self.fewer(now, _SHORT)), _SHORT)
             # What does the same as a member needs the numbers that the others have beside that.
-            pairs = [(i, without(self.library, f.spec, k)) for i, f in enumerate(before) for k in range(len(f.members))]
+            pairs = [(i, without(self.library, s, k)) for i, s in enumerate(now) for k in range(len(s.members))]
             less = fit_many(self.problem, self.whitening, pairs, 0, nuisance=self.nuisance)
             bases = [[fit for (j, _), fit in zip(pairs, less, strict=True) if j == i] for i in range(self.axes)]
             self.fit(self.screened(bases, 1, [{f.members} for f in before]), _SHORT)
-            self.fit([[f.spec for f in self.leading(i)] for i in range(self.axes)], _LONG)
-            if all(a.members == b.members for a, b in zip(before, self.best(), strict=True)):
-                return
+            self.fit([[f.spec for f in self.leading(i) if on] for i, on in enumerate(going)], _LONG)
+            going = [a.members != b.members for a, b in zip(before, self.best(), strict=True)]
 
-    def twins(self) -> bool:
-        """The most probable sets with another gain in the place of an inertia; whether one of them is the best now."""
+    def twins(self) -> None:
+        """The most probable sets with another gain in the place of an inertia."""
         if self.problem.known.get("gain") == 0:
-            return False
-        before, wanted = self.best(), []
+            return
+        wanted = []
         for i, ranked in enumerate(self.ranked()):
             twins = [t for f in ranked[:_KEPT] if (t := with_gain(self.library, i, f.spec)) is not None]
             # Friction that was too large by as much as the inertia is none beside the gain.
             wanted.append([*twins, *(without(self.library, t, k) for t in twins for k in range(len(t.members)))])
         self.fit(wanted, _LONG)
-        return any(a.members != b.members for a, b in zip(before, self.best(), strict=True))
 
     def reduced(self) -> None:
         """The most probable set of each axis without its least members, one after the other, down to none."""

@@ -75,6 +75,11 @@ class Fit(NamedTuple):
         return self.spec.members
 
 
+def nothing(library: Library) -> Spec:
+    """The set without any effect."""
+    return Spec((), torch.zeros(library.size, dtype=torch.float64), (), 0.0)
+
+
 def started(library: Library, spec: Spec, variant: Variant, axis: int) -> Spec:
     """The set with one effect more, which begins as its variant says."""
     theta = spec.theta.clone()
