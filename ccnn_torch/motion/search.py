@@ -75,8 +75,8 @@ def search(problem: Problem) -> Search:
         for some in (_FIRST, _SCREENED)
     )
     plain = _Pool(fewest, white_noise(n))
-    # What is left is all that this is for.
-    plain.forward(1, _FEW)
+    # Before it is whitened a residual has the fewest local optima.
+    plain.forward()
     largest = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
     pool = _Pool(fewest, fitted_whitening(problem.pooled(largest), problem.judged))
     pool.again(plain)
@@ -170,13 +170,23 @@ class _Pool:
                 self.found[i][fit.members] = fit
 
     def again(self, other: _Pool) -> None:
-        """Fit the most probable sets of another pool under this noise, and every effect alone."""
-        ranked = other.ranked()
-        self.fit([[f.spec for f in fits[:_KEPT] if len(f.members) > 1] for fits in ranked], _LONG)
-        self.fit([[f.spec for f in fits if len(f.members) == 1] for fits in ranked], _FEW)
+        """Fit the most probable sets of another pool under this noise, those of each size, and every effect alone."""
+        wanted = []
+        for fits in other.ranked():
+            by_size = {len(f.members): f.spec for f in reversed(fits) if len(f.members) > 1}
+            several = [*(f.spec for f in fits[:_KEPT] if len(f.members) > 1), *by_size.values()]
+            wanted.append([*{spec.members: spec for spec in several}.values()])
+        self.fit(wanted, _LONG)
+        self.fit([[f.spec for f in fits if len(f.members) == 1] for fits in other.ranked()], _FEW)
 
-    def forward(self, beam: int = _BEAM, steps: int = _SHORT) -> None:
-        """Add effects one after the other to the `beam` most probable sets, as long as that brings evidence."""
+    def forward(self, beam: int = _BEAM, steps: int = _SHORT, fitted: int = _FITTED) -> None:
+        """Add effects one after the other, as long as that brings evidence.
+
+        Args:
+            beam: so many of the most probable sets are extended.
+            steps: as of `fit_many`.
+            fitted: effects that are fitted beside each, those that promise most.
+        """
         done: list[set[tuple[int, ...]]] = [set() for _ in range(self.axes)]
         gains = [True] * self.axes
         for _ in range(_MOST):
@@ -187,9 +197,9 @@ class _Pool:
             ]
             for d, own in zip(done, bases, strict=True):
                 d |= {f.members for f in own}
-            # Alone every effect is fitted: its own share of the gap is told.
-            alone = all(not f.members for own in bases for f in own)
-            self.fit(self.screened(bases, len(self.library.names) if alone else _FITTED), steps)
+            # Alone, where its own share of the gap is told, and beside one other every effect is fitted.
+            small = all(len(f.members) < 2 for own in bases for f in own)
+            self.fit(self.screened(bases, len(self.library.names) if small else fitted), steps)
             leading = [self.leading(i)[:beam] if own else [] for i, own in enumerate(bases)]
             self.fit([[f.spec for f in own if f.members] for own in leading], steps)
             after = [self.scored(i)[0][0] for i in range(self.axes)]
@@ -203,11 +213,12 @@ class _Pool:
         likely = self.likely()
         # Sets that are probable although forms are wrong are smaller than those above.
         self.weigh_forms()
+        # No screen is sure: beside the best one every effect is fitted.
+        self.forward(1, _SHORT, len(self.library.names))
         self.neighbours([True] * self.axes)
-        for extend in (self.twins, self.forward):
-            before = self.best()
-            extend()
-            self.neighbours([a.members != b.members for a, b in zip(before, self.best(), strict=True)])
+        before = self.best()
+        self.twins()
+        self.neighbours([a.members != b.members for a, b in zip(before, self.best(), strict=True)])
         for own, more, found in zip(likely, self.likely(), self.found, strict=True):
             own |= more | {members: fit.spec for members, fit in found.items() if len(members) == 1}
         self.variance = None
