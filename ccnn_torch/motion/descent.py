@@ -32,7 +32,7 @@ _FARTHEST = 5.0
 # Simulated values that are held in memory at a time.
 _VALUES = 3e7
 # Half deviance for each value that a step must gain for another one to be made.
-_GAINED = 3e-4
+_GAINED = 1e-4
 
 
 def lots(problem: Problem, specs: Sequence[tuple[int, Spec]]) -> Iterator[Sequence[tuple[int, Spec]]]:
