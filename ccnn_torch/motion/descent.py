@@ -205,7 +205,7 @@ def _tried(
     here, shares = run[those], move.new_tensor(_SHARES)
     moved = theta[here].expand(len(shares), -1, -1)
     moved = moved.scatter_add(-1, active[those].expand(len(shares), -1, -1), shares[:, None, None] * move[those])
-    left = white(moved.flatten(0, 1), here.repeat(len(shares))).unflatten(0, (len(shares), -1))
+    left = white(moved.flatten(0, 1), here.repeat(len(shares))).reshape(len(shares), len(here), -1)
     gain, best = (_cost(residual[here], theta[here], values) - _cost(left, moved, values)).max(0)
     better = (gain > 0).nonzero()[:, 0]
     share[those[better]], gained[those[better]] = shares[best[better]], gain[better]
@@ -268,7 +268,7 @@ def refitted(
         theta = torch.stack([s.theta for _, s in lot])
         both = sensitivities(problem, whitening, theta, axis, places)
         for own, rows in zip(found, parts, strict=True):
-            begin = Point(theta, *(v.unflatten(-1, (len(problem.judged), -1))[..., rows, :].flatten(-2) for v in both))
+            begin = Point(theta, *(v.reshape(*v.shape[:-1], len(problem.judged), -1)[..., rows, :].flatten(-2) for v in both))
             values, goal = float(problem.judged[rows].sum()), torch.full_like(theta[:, 0], math.inf)
             own.append(descended(problem, whitening, begin, axis, places, 1, values, goal, rows)[0].theta)
     return [torch.cat(own) for own in found]
