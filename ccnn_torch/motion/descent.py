@@ -268,7 +268,9 @@ def refitted(
         theta = torch.stack([s.theta for _, s in lot])
         both = sensitivities(problem, whitening, theta, axis, places)
         for own, rows in zip(found, parts, strict=True):
-            begin = Point(theta, *(v.reshape(*v.shape[:-1], len(problem.judged), -1)[..., rows, :].flatten(-2) for v in both))
+            begin = Point(
+                theta, *(v.reshape(*v.shape[:-1], len(problem.judged), -1)[..., rows, :].flatten(-2) for v in both)
+            )
             values, goal = float(problem.judged[rows].sum()), torch.full_like(theta[:, 0], math.inf)
             own.append(descended(problem, whitening, begin, axis, places, 1, values, goal, rows)[0].theta)
     return [torch.cat(own) for own in found]
