@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.motion.compilable import is_compiled
-from ccnn_torch.motion.course import compiled, course
-from ccnn_torch.motion.stage import ABSENT, TINY, Axis, Has, axis_of, each_has
+from ccnn_torch.motion.course import course, courses
+from ccnn_torch.motion.stage import ABSENT, TINY, Axis, Given, Has, axis_of, each_has
 
 Array = NDArray[np.float64]
 # Steps longer than this, in units of the axis' own time constant, are divided.
@@ -48,6 +48,7 @@ class Drive(NamedTuple):
         torque: what else resists the motor, over the nominal gain, `b x s` [rad or m].
         bent: share of a parabola by which commands leave the straight line between samples, `b`: 0 where every sample
             is there, nearly 1 of those that were thinned; None = 0.
+        usual: median step, `b` [s]; None = that of `time`.
     """
 
     time: Tensor
@@ -57,6 +58,7 @@ class Drive(NamedTuple):
     warm: Tensor | None = None
     torque: Tensor | None = None
     bent: Tensor | None = None
+    usual: Tensor | None = None
 
 
 def delayed(time: Tensor, values: Tensor, delay: Tensor) -> Tensor:
@@ -99,37 +101,41 @@ def simulate_axes(
     runs = np.broadcast_to(np.arange(b), (p, b)) if rows is None else rows.numpy()
     # Where all runs have the same parameters they stand there once.
     wide = max([1, *(v.shape[-1] for v in parameters.values())])
-    a = dict(zip(ABSENT, np.repeat([*ABSENT.values()], p * wide).reshape(-1, p, wide), strict=True))
-    for name in a.keys() & parameters.keys():
-        a[name][:] = parameters[name].numpy()
-    axis, offset = Axis(*(v.ravel() for v in axis_of(a))), a["offset"].ravel()
+    given = np.tile(np.array([*ABSENT.values()]), (p, wide, 1))
+    for k, name in enumerate(ABSENT):
+        if name in parameters:
+            given[..., k] = parameters[name].numpy()
+    a = Given(*given.reshape(-1, len(ABSENT)).T)
     # Which parameters and which run each one has.
     own = (np.arange(p)[:, None] * wide + np.arange(runs.shape[1]) % wide).ravel()
     run = np.ascontiguousarray(runs).ravel()
     # The fastest motion of an axis is that of its mass on the gain: each has steps of its own, whatever is beside it.
-    masses = axis.whole / np.maximum(axis.gain, TINY)
+    masses = a.inertia / np.maximum(a.gain, TINY)
     fast_ones = np.sqrt(np.where(masses > 0, masses, math.inf))[own]
-    usual = np.median(drive.time.diff(dim=-1).numpy(), -1)[run % len(drive.time)]
-    parts = np.clip(np.ceil(usual / np.maximum(fast_ones, TINY) / _LONGEST), 1, _MOST_PARTS).astype(np.int64)
+    usual = np.median(drive.time.diff(dim=-1).numpy(), -1) if drive.usual is None else drive.usual.numpy()
+    parts = np.ceil(usual[run % len(usual)] / np.maximum(fast_ones, TINY) / _LONGEST)
+    parts = np.clip(parts, 1, _MOST_PARTS).astype(np.int64)
     start = np.zeros((b, 3))
     start[:, : drive.start.shape[1]] = drive.start.numpy()
     bent = np.zeros(1) if drive.bent is None else drive.bent.numpy()
-    there = (True, bool(axis.supply.any()), bool(axis.thermal.any()))
+    there = (True, bool(a.supply.any()), bool(a.thermal.any()))
     push, supply, warm = (
         np.ascontiguousarray(one.numpy()) if has and one is not None else np.zeros((1, 1))
         for one, has in zip((drive.torque, drive.supply, drive.warm), there, strict=True)
     )
     time, command = (np.ascontiguousarray(one.numpy()) for one in (drive.time, drive.command))
     if is_compiled() if fast is None else fast:
-        together = compiled(axis, offset, own, run, time, command, start, bent, push, supply, warm, parts)
+        together = courses(
+            given.reshape(-1, len(ABSENT)), own, run, time, command, start, bent, push, supply, warm, parts
+        )
         return torch.from_numpy(together).reshape(*runs.shape, s)
-    delay, row, at = torch.from_numpy(a["delay"].ravel()[own]), run % len(time), torch.from_numpy(run)
+    delay, row, at = torch.from_numpy(a.delay[own]), run % len(time), torch.from_numpy(run)
     late = drive.command[at]
     if bool((delay != 0).any()):
         moved = delayed(drive.time[torch.from_numpy(row)], late, delay[None])[0]
         late = torch.where(delay[:, None] != 0, moved, late)
-    u, step = late.numpy() + offset[own, None], np.diff(time)
-    found = np.empty((len(run), s))
+    u, step = late.numpy() + a.offset[own, None], np.diff(time)
+    found, axis = np.empty((len(run), s)), axis_of(a)
     for many in np.unique(parts):
         here = np.flatnonzero(parts == many)
         some = Axis(*(v[own[here]] for v in axis))

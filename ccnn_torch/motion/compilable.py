@@ -10,6 +10,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
+# Files of the functions that are compiled.
+_SOURCES: set[str] = {__file__}
 
 try:
     import numba
@@ -21,6 +23,7 @@ except ImportError:
 
 def compilable(function: F) -> F:
     """The function itself, of numbers or arrays; what calls it may be compiled."""
+    _SOURCES.add(function.__code__.co_filename)
     if numba is None:
         return function
     found: F = register_jitable(forceinline=True)(function)
@@ -33,11 +36,11 @@ def is_compiled() -> bool:
 
 
 def loop(function: F) -> F:
-    """The function, compiled at its first call; later processes find it on the disk, until a file here changes."""
+    """The function, compiled at its first call; later processes find it on the disk, until its source changes."""
     if numba is None:
         return function
-    # Numba looks at the file of the function alone, not at those of what it calls.
-    sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+    # Numba looks at the file of the function alone, not at those of what it calls, which are imported before it.
+    sources = b"".join(Path(path).read_bytes() for path in sorted({*_SOURCES, function.__code__.co_filename}))
     function.__qualname__ += f"_{zlib.crc32(sources):08x}"
     return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
 

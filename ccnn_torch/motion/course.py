@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.motion.compilable import compilable, fixed_tuple, loop, pick
-from ccnn_torch.motion.stage import TINY, Array, Axis, Has, Sample, advanced, begun, each_has
+from ccnn_torch.motion.stage import TINY, Array, Axis, Given, Has, Sample, advanced, axis_of, begun, each_has
 
 
 @compilable
@@ -178,12 +178,12 @@ def _late(time: Array, values: Array, delay: Any) -> Array:
     return found
 
 
-_OF_AXIS, _OF_HAS = len(Axis._fields), len(Has._fields)
+_PARAMETERS = len(Given._fields)
 
 
-def compiled(
-    axis: Axis,
-    offset: Array,
+@loop
+def courses(
+    given: Array,
     own: NDArray[np.int64],
     run: NDArray[np.int64],
     time: Array,
@@ -198,7 +198,7 @@ def compiled(
     """Courses of `c` axes, one after the other, `c x s`.
 
     Args:
-        axis, offset: parameters of the axes, and the offsets of their positions.
+        given: parameters of axes, a row each as `Given`.
         own: which of these each has, `c`.
         run: and which row of those below, which are repeated where there are fewer, `c`.
         time, command: `b x s`.
@@ -207,35 +207,14 @@ def compiled(
         push, supply, warm: `b x s`, or `1 x 1` where there is nothing.
         parts: into how many the steps are divided, `c`.
     """
-    every, each = (np.stack(v, -1) for v in (axis, each_has(axis)))
-    return _courses(every, each, offset, own, run, time, command, start, bent, push, supply, warm, parts)
-
-
-@loop
-def _courses(
-    every: Array,
-    each: NDArray[np.bool_],
-    offset: Array,
-    own: NDArray[np.int64],
-    run: NDArray[np.int64],
-    time: Array,
-    command: Array,
-    start: Array,
-    bent: Array,
-    push: Array,
-    supply: Array,
-    warm: Array,
-    parts: NDArray[np.int64],
-) -> Array:
     found = np.empty((len(run), time.shape[1]))
     for j in range(len(run)):
-        i, b = own[j], run[j]
-        axis, has = Axis(*fixed_tuple(every[i], _OF_AXIS)), Has(*fixed_tuple(each[i], _OF_HAS))
+        b, parameters = run[j], Given(*fixed_tuple(given[own[j]], _PARAMETERS))
+        axis = axis_of(parameters)
         times = time[b % len(time)]
         u = _late(times, command[b], axis.delay) if axis.delay != 0 else command[b].copy()
-        u += offset[i]
+        u += parameters.offset
         pushed, volts, heat = push[b % len(push)], supply[b % len(supply)], warm[b % len(warm)]
-        found[j] = course(
-            axis, has, times[1:] - times[:-1], u, start[b], bent[b % len(bent)], pushed, volts, heat, parts[j]
-        )
+        step, has = times[1:] - times[:-1], each_has(axis)
+        found[j] = course(axis, has, step, u, start[b], bent[b % len(bent)], pushed, volts, heat, parts[j])
     return found

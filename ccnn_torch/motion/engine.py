@@ -215,17 +215,24 @@ def _effects_of(
 ) -> list[dict[str, Any]]:
     """`effects`; alone: the gap with each effect alone in the model."""
     library = problem.library
+    named = {m for v in verdicts for m in v.best.members}
+    # The fits that tell the numbers of each effect: of the verdict, or of the effect alone where none has it.
+    shown: list[tuple[int, int, Fit]] = []
+    for e in map(library.names.index, alone):
+        for i, v in enumerate(verdicts):
+            single = () if e in named else (f for f in found.found[i] if f.members == (e,))
+            fit = v.best if e in v.best.members else next(iter(single), None)
+            shown += [] if fit is None else [(e, i, fit)]
+    spread = deviations([fit for *_, fit in shown], [found.found[i][0].noise + found.form[i] for _, i, _ in shown])
+    parameters: dict[int, dict[str, Any]] = {}
+    for (e, i, fit), own in zip(shown, spread, strict=True):
+        parameters.setdefault(e, {}).update(_parameters(library, i, fit, e, own))
     rows = []
-    for name, own in alone.items():
+    for name, gap in alone.items():
         e = library.names.index(name)
         like = dict.fromkeys(library.names[o] for v in verdicts for o in v.classes.get(e, ()))
-        parameters: dict[str, Any] = {}
-        for i, v in enumerate(verdicts):
-            fit = v.best if e in v.best.members else next((f for f in found.found[i] if f.members == (e,)), None)
-            if fit is not None and (e in v.best.members or not any(e in w.best.members for w in verdicts)):
-                parameters |= _parameters(library, i, fit, e, found.found[i][0].noise + found.form[i])
         probability = 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts)
-        rows.append(effect_block(name, probability, parameters, own, like, {}))
+        rows.append(effect_block(name, probability, parameters.get(e, {}), gap, like, {}))
     return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
 
 
@@ -357,15 +364,14 @@ def _unit(unit: str, axis: Facts) -> tuple[str, float]:
     return known.get(unit, (unit, 1.0))
 
 
-def _parameters(library: Library, axis: int, fit: Fit, effect: int, variance: float) -> dict[str, dict[str, Any]]:
+def _parameters(library: Library, axis: int, fit: Fit, effect: int, deviation: Tensor) -> dict[str, dict[str, Any]]:
     """The numbers of one effect of a fit, as `parameters` of diagnosis.json; value: the difference to the model.
 
-    variance: of noise and form errors.
+    deviation: of the fit's numbers, in plausible sizes.
     """
     facts = library.facts[axis]
     found: dict[str, dict[str, Any]] = {}
     flat = fit.spec.flat
-    deviation = deviations(fit, variance)
     for j in (j for j in library.places[effect] if j in flat):
         number: Number = library.numbers[axis][j]
         unit, factor = _unit(number.unit, facts)

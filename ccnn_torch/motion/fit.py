@@ -12,32 +12,15 @@ from torch import Tensor
 from ccnn_torch.evidence.dictionary import CERTAIN
 from ccnn_torch.evidence.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_variance
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of, scaled
-from ccnn_torch.evidence.priors import WIDE
+from ccnn_torch.motion.descent import Point, descended, lots, padded, renew, sensitivities
 from ccnn_torch.motion.effects import EXACT
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.spec import Fit, Spec
 from ccnn_torch.motion.whiten import Whitening
 
-# Of a difference quotient, in plausible sizes.
-_STEP = 1e-3
 _STEPS = 6
-# How often numbers at an end of what they may be are looked for in a step.
-_HELD = 3
-# Shares of a Gauss-Newton step that are tried, and what a step is damped by.
-_SHARES = (1.0, 0.25)
-_DAMPING, _LESS, _MORE = 1e-3, 0.2, 10.0
-# Trials for each time that columns are simulated, and share of a promised gain from which columns still hold.
-_TRIALS, _AS_PROMISED = 3, 0.5
-# Share of the steps of a set that leaves so many times the squares of the best one.
-_FAR, _NEAR = 0.5, 1.05
-# A set whose step fails at this damping has ended.
-_STIFF = 10.0
-# Plausible sizes that a number moves at most in a step.
-_FARTHEST = 5.0
-# Simulated values that are held in memory at a time.
-_VALUES = 3e7
-# Half deviance for each value that a step must gain for another one to be made.
-_GAINED = 1e-4
+# Sets come near the best one that leave at most so many times its squares.
+_NEAR = 1.05
 # Share of what an effect does in one run from which the others hardly tell its numbers, and from which not at all.
 _ONCE, ALONE = 0.9, 0.99
 # Share φ of what the nominal model makes of the command: as of an effect, but most of it is right.
@@ -49,7 +32,6 @@ def fit_many(
     whitening: Whitening,
     specs: Sequence[tuple[int, Spec]],
     steps: int = _STEPS,
-    chosen: Tensor | None = None,
     nuisance: Tensor | None = None,
     reached: Tensor | None = None,
 ) -> list[Fit]:
@@ -59,70 +41,15 @@ def fit_many(
         problem: what is fitted.
         whitening: of the residual of each axis.
         specs: the axis and the set of each fit.
-        steps: Gauss-Newton steps.
-        chosen: stretches that count; all when None.
+        steps: how often columns are simulated at most.
         nuisance: whitened, what the nominal values of each axis may be off by, `n x k x v`; nothing when None.
         reached: squares that the best set of each axis leaves, whitened, `n`: of sets that come nowhere near, columns
             are simulated half as often. None = no set is known.
     """
-    judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
     found: list[Fit] = []
-    lot: list[tuple[int, Spec]] = []
-    for k, (axis, spec) in enumerate(specs):
-        lot.append((axis, spec))
-        simulated = sum(len(one.moved) + 2 for _, one in lot) * judged.numel()
-        if simulated > _VALUES or k == len(specs) - 1:
-            found += _fit_lot(problem, whitening, lot, steps, chosen, nuisance, reached)
-            lot = []
+    for lot in lots(problem, specs):
+        found += _fit_lot(problem, whitening, lot, steps, nuisance, reached)
     return found
-
-
-def sensitivities(
-    problem: Problem,
-    whitening: Whitening,
-    theta: Tensor,
-    axis: Tensor,
-    places: Sequence[Sequence[int]],
-    chosen: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Whitened residuals and what numbers change in the positions.
-
-    Args:
-        theta: `p x k`.
-        axis: of each row, `p`.
-        places: of the numbers of each row.
-
-    Returns:
-        `p x v` and `p x m x v`, `v` values; beyond a row's own numbers 0.
-    """
-    residual = _white(problem, whitening, theta, axis, chosen)
-    return residual, _columns(problem, whitening, theta, axis, places, residual, chosen)
-
-
-def _white(problem: Problem, whitening: Whitening, theta: Tensor, axis: Tensor, chosen: Tensor | None) -> Tensor:
-    return problem.whitened(problem.residual(theta, axis, chosen), axis, whitening, chosen)
-
-
-def _columns(
-    problem: Problem,
-    whitening: Whitening,
-    theta: Tensor,
-    axis: Tensor,
-    places: Sequence[Sequence[int]],
-    residual: Tensor,
-    chosen: Tensor | None,
-) -> Tensor:
-    """As `sensitivities`; residual: whitened, `p x v`."""
-    counts = torch.tensor([len(own) for own in places], dtype=torch.int64)
-    which = torch.repeat_interleave(torch.arange(len(places)), counts)
-    columns = residual.new_zeros(len(theta), int(counts.max()) if len(counts) else 0, residual.shape[1])
-    if len(which):
-        # One row for every number that is moved.
-        moved = theta[which]
-        moved[torch.arange(len(which)), torch.tensor([j for own in places for j in own])] += _STEP
-        column = torch.cat([torch.arange(int(c)) for c in counts])
-        columns[which, column] = (residual[which] - _white(problem, whitening, moved, axis[which], chosen)) / _STEP
-    return columns
 
 
 def _fit_lot(
@@ -130,134 +57,25 @@ def _fit_lot(
     whitening: Whitening,
     specs: Sequence[tuple[int, Spec]],
     steps: int,
-    chosen: Tensor | None,
     nuisance: Tensor | None,
     reached: Tensor | None,
 ) -> list[Fit]:
-    axis = torch.tensor([i for i, _ in specs])
+    axis, places = torch.tensor([i for i, _ in specs]), [s.moved for _, s in specs]
     theta = torch.stack([s.theta for _, s in specs])
-    places = [s.moved for _, s in specs]
-    judged = problem.judged if chosen is None else problem.judged[chosen]
+    judged = problem.judged
     values = float(judged.sum())
     goal = torch.full_like(theta[:, 0], math.inf) if reached is None else _NEAR * reached[axis]
-    theta, residual, columns = _descended(problem, whitening, theta, axis, places, steps, values, chosen, goal)
+    begin = Point(theta, *sensitivities(problem, whitening, theta, axis, places))
+    point, is_exact, settled = descended(problem, whitening, begin, axis, places, steps, values, goal)
+    renew(problem, whitening, point, axis, places, (~is_exact).nonzero()[:, 0])
     # Here, since the whitened residual does not tell it.
-    plain = problem.pooled(problem.residual(theta, axis, chosen))
+    plain = problem.pooled(problem.residual(point.theta, axis))
     left = (plain.square() * judged).sum((-1, -2)) / values
-    folds = [
-        (own if chosen is None else own[chosen])[:, None].expand(judged.shape).flatten()
-        for own in (problem.fold, problem.part)
-    ]
-    ended = [spec._replace(theta=now) for (_, spec), now in zip(specs, theta, strict=True)]
-    beside = residual.new_zeros(len(specs), 0, residual.shape[1]) if nuisance is None else nuisance[axis]
-    return _fits_of(ended, residual, columns, values, left.tolist(), folds, beside)
-
-
-def _descended(
-    problem: Problem,
-    whitening: Whitening,
-    theta: Tensor,
-    axis: Tensor,
-    places: Sequence[Sequence[int]],
-    steps: int,
-    values: float,
-    chosen: Tensor | None,
-    goal: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Numbers where Gauss-Newton steps end, with residuals and columns there, as of `sensitivities`.
-
-    From step to step columns follow what the residuals do (Broyden 1965), and are simulated anew where that promised
-    another gain than there was, or none.
-    """
-    theta = theta.clone()
-    residual, columns = sensitivities(problem, whitening, theta, axis, places, chosen)
-    active, real = _padded(places)
-    low, high = (bound[axis].gather(-1, active) for bound in problem.library.bounds)
-    damping = torch.full((len(theta),), _DAMPING, dtype=theta.dtype)
-    made, is_exact = torch.zeros(len(theta)), torch.ones(len(theta), dtype=torch.bool)
-    run = torch.tensor([k for k, own in enumerate(places) if own and steps], dtype=torch.int64)
-
-    def renew(those: Tensor) -> None:
-        own = [places[k] for k in those.tolist()]
-        new = _columns(problem, whitening, theta[those], axis[those], own, residual[those], chosen)
-        columns[those, : new.shape[1]] = new
-
-    for _ in range(_TRIALS * steps):
-        if not len(run):
-            break
-        x, y, own, at = columns[run], residual[run], theta[run].gather(-1, active[run]), theta[run]
-        ends = ((low[run] - own) * real[run], (high[run] - own) * real[run])
-        move = _step(x, y, own * real[run], ends, damping[run], values)
-        cost = _cost(y, at, values)
-        least = _cost(y - (move[:, None] @ x)[:, 0], at.scatter_add(-1, active[run], move), values)
-        promised, best, share_of = cost - least, cost.clone(), torch.zeros_like(cost)
-        for share in _SHARES:
-            # A shorter step, too, where columns are those of where it begins, or the whole one was none.
-            those = ((promised >= _GAINED * values) & (is_exact[run] | (best >= cost))).nonzero()[:, 0]
-            if not len(those):
-                break
-            here = run[those]
-            tried = at[those].scatter_add(-1, active[here], share * move[those])
-            white = _white(problem, whitening, tried, axis[here], chosen)
-            reached = _cost(white, tried, values)
-            better = reached < best[those]
-            best[those[better]], share_of[those[better]] = reached[better], share
-            theta[here[better]], residual[here[better]] = tried[better], white[better]
-        gained = cost - best
-        good = (gained > 0).nonzero()[:, 0]
-        step = (share_of[:, None] * move)[good]
-        surprise = y[good] - residual[run[good]] - (step[:, None] @ x[good])[:, 0]
-        columns[run[good]] += (step / step.square().sum(-1, keepdim=True))[..., None] * surprise[:, None]
-        is_exact[run[good]] = False
-        damping[run] *= torch.where(share_of == 1, _LESS, 1.0)
-        poor = gained < torch.maximum(_AS_PROMISED * promised, promised.new_tensor(_GAINED * values))
-        stale = poor & ~is_exact[run]
-        damping[run] *= torch.where((share_of < 1) & ~(stale & (share_of == 0)), _MORE, 1.0)
-        anew = run[stale]
-        if len(anew):
-            renew(anew)
-            made[anew], is_exact[anew] = made[anew] + 1, True
-        ended = is_exact[run] & ~stale & ((promised < _GAINED * values) | (damping[run] >= _STIFF))
-        most = torch.where(residual[run].square().sum(-1) <= goal[run], steps, math.ceil(_FAR * steps))
-        run = run[~ended & (made[run] < most)]
-    anew = (~is_exact).nonzero()[:, 0]
-    if len(anew):
-        renew(anew)
-    return theta, residual, columns
-
-
-def _padded(places: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
-    """Places of the numbers of each row, `p x m`, padded with 0, and 1 where there is one, else 0."""
-    wide = max(map(len, places))
-    active = torch.tensor([[*own, *[0] * (wide - len(own))] for own in places])
-    real = torch.tensor([[k < len(own) for k in range(wide)] for own in places])
-    return active, real.double()
-
-
-def _step(x: Tensor, y: Tensor, own: Tensor, ends: tuple[Tensor, Tensor], damping: Tensor, values: float) -> Tensor:
-    """Damped Gauss-Newton steps, `p x m`.
-
-    Args:
-        x, y: columns `p x m x v` and residuals `p x v`.
-        own: the numbers, `p x m`.
-        ends: least and largest step of each number, `p x m`; both 0 where there is no number.
-        damping: share of the diagonal, `p`.
-        values: how many count.
-    """
-    noise = (y.square().sum(-1) / values).clamp_min(1e-300)[:, None]
-    gram, push = (x @ x.mT) / noise[..., None], (x @ y[..., None])[..., 0] / noise - own / WIDE**2
-    inner = gram + torch.diag_embed(damping[:, None] * gram.diagonal(dim1=-2, dim2=-1) + 1 / WIDE**2)
-    low, high = (end.clamp(-_FARTHEST, _FARTHEST) for end in ends)
-    move, held = torch.zeros_like(own), low == high
-    for _ in range(_HELD):
-        # Numbers that a step would take beyond an end stay there, and the others make the best of that.
-        there = torch.where(held, move, 0.0)
-        rest = (push - (inner @ there[..., None])[..., 0]) * ~held
-        left = inner * (~held[:, :, None] & ~held[:, None, :]) + torch.diag_embed(held.to(inner.dtype))
-        free: Tensor = torch.linalg.solve(left, rest[..., None])[..., 0]
-        move = torch.maximum(torch.minimum(there + free, high), low)
-        held = held | (move != there + free)
-    return move
+    folds = [own[:, None].expand(judged.shape).flatten() for own in (problem.fold, problem.part)]
+    ended = [spec._replace(theta=now) for (_, spec), now in zip(specs, point.theta, strict=True)]
+    beside = theta.new_zeros(len(specs), 0, point.residual.shape[1]) if nuisance is None else nuisance[axis]
+    found = _fits_of(ended, point.residual, point.columns, values, left.tolist(), folds, beside)
+    return [fit._replace(settled=end) for fit, end in zip(found, settled.tolist(), strict=True)]
 
 
 def _fits_of(
@@ -278,7 +96,7 @@ def _fits_of(
         left: mean square of the residual itself.
         folds: of each value, `v`: whole runs, and parts of them.
     """
-    places, real = _padded([spec.flat for spec in specs])
+    places, real = padded([spec.flat for spec in specs])
     x = columns[:, : places.shape[1]] * real[..., None]
     own = torch.stack([spec.theta for spec in specs]).gather(-1, places) * real
     groups = [spec.groups for spec in specs]
@@ -311,6 +129,7 @@ def _fits_of(
             once[k],
             left[k],
             Grams(grams.xx[k][at[:, None], at], grams.xy[k, at], grams.yy[k], values),
+            False,
         )
         for k, (spec, evidence, at) in enumerate(zip(specs, found.log_evidence.tolist(), kept, strict=True))
     ]
@@ -351,12 +170,6 @@ def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Sequence[Te
         mean = torch.linalg.solve(whole - a @ a.mT, along - a @ b[..., None])
         found += (b - (mean.mT @ a)[:, 0]).square().sum(-1)
     return found
-
-
-def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:
-    """Half the deviance, `p`; residual `p x v`, theta `p x k`."""
-    rss = residual.square().sum(-1)
-    return 0.5 * values * torch.log(rss.clamp_min(1e-300)) + 0.5 * theta.square().sum(-1) / WIDE**2
 
 
 def form_errors(
@@ -410,20 +223,24 @@ def evidences(models: Sequence[tuple[Grams, Sequence[Tensor]]], variance: float)
         models: inner products as `weighed` takes them, and the groups of the columns that are fitted.
         variance: of the noise.
     """
-    apart = [_under_noise(grams, sum(map(len, groups)), variance) for grams, groups in models]
-    widest = max(len(own.xy) for own in apart)
+    apart = side_by_side([_under_noise(grams, sum(map(len, groups)), variance) for grams, groups in models])
+    found: list[float] = fit_sets(apart, [groups for _, groups in models], CERTAIN * apart.values).log_evidence.tolist()
+    return found
+
+
+def side_by_side(models: Sequence[Grams]) -> Grams:
+    """Inner products of `p` models as those of one batch, padded with 0 to the widest."""
+    widest = max(len(own.xy) for own in models)
 
     def wide(values: Tensor) -> Tensor:
         return torch.nn.functional.pad(values, (0, widest - values.shape[-1]) * values.dim())
 
-    grams = Grams(
-        torch.stack([wide(own.xx) for own in apart]),
-        torch.stack([wide(own.xy) for own in apart]),
-        torch.stack([own.yy for own in apart]),
-        apart[0].values,
+    return Grams(
+        torch.stack([wide(own.xx) for own in models]),
+        torch.stack([wide(own.xy) for own in models]),
+        torch.stack([own.yy for own in models]),
+        models[0].values,
     )
-    found: list[float] = fit_sets(grams, [groups for _, groups in models], CERTAIN * grams.values).log_evidence.tolist()
-    return found
 
 
 def _under_noise(grams: Grams, columns: int, variance: float) -> Grams:
@@ -437,15 +254,21 @@ def _under_noise(grams: Grams, columns: int, variance: float) -> Grams:
     )
 
 
-def deviations(fit: Fit, variance: float) -> Tensor:
-    """Standard deviations of a set's numbers, `m` in plausible sizes, under a noise that holds form errors as well.
+def deviations(fits: Sequence[Fit], variances: Sequence[float]) -> list[Tensor]:
+    """Standard deviations of the numbers of sets, `m` in plausible sizes each, under noises that hold form errors too.
 
     The values of the nominal model are taken for exact here.
     """
-    m, grams = len(fit.spec.flat), fit.grams
-    own = grams._replace(xx=grams.xx[:m, :m], xy=grams.xy[:m])
-    found = weighed(own, [fit.spec.groups], m, max(variance, fit.noise))
-    return found.covariance[0, :m, :m].diagonal().clamp_min(0).sqrt()
+    if not fits:
+        return []
+    own = []
+    for fit, variance in zip(fits, variances, strict=True):
+        m = len(fit.spec.flat)
+        grams = fit.grams._replace(xx=fit.grams.xx[:m, :m], xy=fit.grams.xy[:m])
+        own.append(scaled(grams, max(variance, fit.noise)))
+    found = fit_sets(side_by_side(own), [fit.spec.groups for fit in fits], CERTAIN * own[0].values)
+    spread = found.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    return [sd[: len(fit.spec.flat)] for sd, fit in zip(spread, fits, strict=True)]
 
 
 def unseen_errors(found: Sequence[Sequence[Fit]]) -> list[float]:

@@ -8,15 +8,13 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.shrink import Draws, Gap, HeldOut, shrink_of
-from ccnn_torch.motion.fit import fit_many
+from ccnn_torch.motion.descent import refitted
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
-from ccnn_torch.motion.spec import Spec, without
+from ccnn_torch.motion.spec import Spec, nothing, without
 from ccnn_torch.motion.whiten import Whitening
-
-_STEPS = 3
 
 
 def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spec]]) -> Tensor:
@@ -30,11 +28,11 @@ def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spe
     pairs = [(i, spec) for row in sets for i, spec in enumerate(row)]
     axis = problem.axes.repeat(len(sets))
     left = problem.residual(torch.stack([spec.theta for _, spec in pairs]), axis)
-    folds = int(problem.fold.max()) + 1
-    for k in range(folds if folds > 1 else 0):
-        here, rest = (problem.fold == k).nonzero()[:, 0], (problem.fold != k).nonzero()[:, 0]
-        fits = fit_many(problem, whitening, pairs, _STEPS, rest)
-        left[:, here] = problem.residual(torch.stack([f.spec.theta for f in fits]), axis, here)
+    folds = range(int(problem.fold.max()) + 1) if int(problem.fold.max()) else ()
+    parts = [(problem.fold != k).nonzero()[:, 0] for k in folds]
+    for k, theta in enumerate(refitted(problem, whitening, pairs, parts)):
+        here = (problem.fold == k).nonzero()[:, 0]
+        left[:, here] = problem.residual(theta, axis, here)
     return left.reshape(len(sets), -1, *left.shape[1:])
 
 
@@ -66,10 +64,9 @@ def only(library: Library, spec: Spec, members: Sequence[int]) -> Spec:
 def singles(found: Search) -> dict[str, list[Spec]]:
     """Of each effect alone its fit on every axis; an axis that cannot show it has none."""
     library = found.problem.library
-    none = Spec((), torch.zeros(library.size, dtype=torch.float64), (), 0.0)
     alone = [{f.members[0]: f.spec for f in fits if len(f.members) == 1} for fits in found.found]
     return {
-        name: [own.get(e, none) for own in alone]
+        name: [own.get(e, nothing(library)) for own in alone]
         for e, name in enumerate(library.names)
         if any(e in own for own in alone)
     }

@@ -21,7 +21,8 @@ from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.evidence.judge import judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets
 from ccnn_torch.evidence.priors import OUTSIDE, crowd
-from ccnn_torch.motion.fit import evidences, products, sensitivities, squares_unseen
+from ccnn_torch.motion.descent import sensitivities
+from ccnn_torch.motion.fit import evidences, products, side_by_side, squares_unseen
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, log_posterior
 from ccnn_torch.motion.spec import Fit, Spec
@@ -220,29 +221,38 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     while chain[-1].members:
         less = [tuple(m for m in chain[-1].members if m != e) for e in chain[-1].members]
         chain.append(min((fits[r] for r in less if r in fits), key=lambda f: f.left, default=fits[()]))
-    sets: list[tuple[int, Candidate]] = []
     taken: list[dict[Members, float]] = [{} for _ in drivers]
     left = {members: fit.left for members, fit in fits.items()}
     # What a driver has to take away: a smooth function can follow what is wrong with the form of a model.
     slight = float((problem.stamped[axis][problem.data.judged] / problem.unit[axis]).square().mean()) * values
-    for base in {f.members: f for f in [*found.found[axis][:_BASES], *chain]}.values():
-        theta, flat = base.spec.theta, list(base.spec.flat)
-        residual, columns = sensitivities(problem, found.whitening, theta[None], mine, [flat])
-        own, y = columns[0], residual[0] + theta[flat] @ columns[0]
-        # Of the position itself, not of its whitened form.
-        left_plain, own_plain = (part[0] for part in sensitivities(problem, plainly, theta[None], mine, [flat]))
-        count = len(base.members)
+    bases = [*{f.members: f for f in [*found.found[axis][:_BASES], *chain]}.values()]
+    theta, at, places = (
+        torch.stack([f.spec.theta for f in bases]),
+        mine.expand(len(bases)),
+        [f.spec.flat for f in bases],
+    )
+    residual, columns = sensitivities(problem, found.whitening, theta, at, places)
+    # Of the position itself, not of its whitened form.
+    left_plain, columns_plain = sensitivities(problem, plainly, theta, at, places)
+    sets: list[tuple[int, Candidate]] = []
+    for b, base in enumerate(bases):
+        own, count = columns[b, : len(places[b])], len(base.members)
+        y = residual[b] + theta[b, list(places[b])] @ own
         prior = prior_of(base) + OUTSIDE + crowd(count + 1) - crowd(count)
-        for k, (driver, columns, beside) in enumerate(zip(drivers, white, plain, strict=True)):
-            x = torch.cat([own, columns])
+        for k, (driver, beside) in enumerate(zip(drivers, white, strict=True)):
+            x = torch.cat([own, beside])
             grams = products(x, found.nuisance[axis], y, values)
-            groups = [*base.spec.groups, torch.arange(len(flat), len(x))]
-            mean = fit_sets(grams, [groups], 0.0).mean[0]
-            rest = left_plain - (mean[: len(flat)] - theta[flat]) @ own_plain - mean[len(flat) : len(x)] @ beside
-            taken[k][base.members] = float(rest.square().sum())
-            gained = float(left_plain.square().sum()) - taken[k][base.members]
-            there = (driver.name,) if gained >= slight else ()
-            sets.append((k, Candidate(base.members, there, grams, groups, prior, (own, columns, y))))
+            groups = [*base.spec.groups, torch.arange(len(own), len(x))]
+            sets.append((k, Candidate(base.members, (driver.name,), grams, groups, prior, (own, beside, y))))
+    means = fit_sets(side_by_side([one.grams for _, one in sets]), [one.groups for _, one in sets], 0.0).mean
+    for n, (k, one) in enumerate(sets):
+        b = n // len(drivers)
+        m = len(places[b])
+        moved = means[n, :m] - theta[b, list(places[b])]
+        rest = left_plain[b] - moved @ columns_plain[b, :m] - means[n, m : m + len(plain[k])] @ plain[k]
+        taken[k][one.members] = float(rest.square().sum())
+        gained = float(left_plain[b].square().sum()) - taken[k][one.members]
+        sets[n] = k, one if gained >= slight else one._replace(drivers=())
     # Beside a driver a name has to do what the driver does not do as well.
     return [one._replace(members=essential(one.members, taken[k] if one.drivers else left, {})) for k, one in sets]
 

@@ -80,6 +80,8 @@ class Library(NamedTuple):
         nominal: parameters of the axes, `n` each.
         lacking: of each effect what every axis lacks to show it; "" where one axis can.
         there: whether an axis can show an effect, `n x effects`.
+        changes: what a unit of each number does to the axes' parameters: its place, the parameter, how, and by how
+            much, `n`.
         about: what is added to each of a simulator's own parameters where it was linearised.
     """
 
@@ -93,6 +95,7 @@ class Library(NamedTuple):
     nominal: dict[str, Tensor]
     lacking: tuple[str, ...]
     there: Tensor
+    changes: tuple[tuple[int, str, str, Tensor], ...]
     about: Mapping[str, float] = {}
 
     @property
@@ -132,9 +135,8 @@ class Library(NamedTuple):
         """
         found = {name: value[axis] for name, value in self.nominal.items()}
         used = (theta != 0).any(0).tolist()
-        for j in (j for j in range(len(self.numbers[0])) if used[j]):
-            for a, (name, _, how) in enumerate(self.numbers[0][j].acts):
-                size = theta.new_tensor([own[j].scale * own[j].acts[a][1] for own in self.numbers])
+        for j, name, how, size in self.changes:
+            if used[j]:
                 amount = theta[:, j] * size[axis]
                 before = found.get(name, torch.full_like(amount, ABSENT.get(name, 0.0)))
                 found[name] = before + amount if how == "add" else before * amount.clamp(-5, 5).exp()
@@ -261,4 +263,10 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
         nominal,
         tuple("" if not all(why) else why[0] for why in lacking),
         torch.tensor([[not why[i] for why in lacking] for i in range(len(facts))]),
+        tuple(
+            (j, act.parameter, act.how, torch.tensor(sizes, dtype=torch.float64))
+            for j, number in enumerate(numbers[0])
+            for a, act in enumerate(number.acts)
+            for sizes in [[own[j].scale * own[j].acts[a].factor for own in numbers]]
+        ),
     )

@@ -262,8 +262,6 @@ def drive_on(
     name: str, time: Array, command: Array, position: Array, beside: Mapping[str, Array], notes: list[str]
 ) -> NDArray[np.bool_]:
     """Where the drive was on: as recorded; else where it gives no output at all although the position is off."""
-    from scipy.ndimage import binary_opening
-
     on = np.ones(len(time), dtype=np.bool_)
     if "torque_on" in beside:
         on = beside["torque_on"] > 0.5
@@ -276,6 +274,9 @@ def drive_on(
                 error = np.abs(command[:, i] - position[:, i])
                 if output is None or not np.any(output):
                     continue
+                # Slow to import, and seldom needed.
+                from scipy.ndimage import binary_opening
+
                 off = binary_opening((output == 0) & (error > _OFF_ERROR * np.ptp(command[:, i])), np.ones(_OFF))
                 if off.any():
                     on &= ~off

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.motion.fit import sensitivities
+from ccnn_torch.motion.descent import sensitivities
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem
@@ -155,6 +155,7 @@ def _problem_of(problem: Problem, axis: int, proposed: Sequence[Motion]) -> Prob
     one = torch.ones(count, dtype=command.dtype)
     nominal["gain"] = nominal.get("gain", one) * one.new_tensor([motion.gain for motion in proposed])
     nominal["gravity_sin"] = nominal.get("gravity_sin", 0 * one) + one.new_tensor([motion.load for motion in proposed])
+    changes = tuple((j, name, how, size[axis].expand(count)) for j, name, how, size in library.changes)
     time = proposed[0].time
     data = problem.data._replace(
         time=time[None],
@@ -170,7 +171,7 @@ def _problem_of(problem: Problem, axis: int, proposed: Sequence[Motion]) -> Prob
     return replace(
         problem,
         data=data,
-        library=library._replace(facts=(), numbers=(library.numbers[axis],) * count, nominal=nominal),
+        library=library._replace(facts=(), numbers=(library.numbers[axis],) * count, nominal=nominal, changes=changes),
         followed=command,
         supply=still,
         warm=still,

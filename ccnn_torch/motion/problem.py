@@ -188,9 +188,9 @@ class Problem:
         """All axes in all stretches, one axis after the other."""
         data, start = self.data, self._start
         torque = None if self.torque is None else self.torque.flatten(0, 1)
-        return Drive(
-            data.time, self.followed.flatten(0, 1), start.flatten(0, 1), self.supply, self.warm, torque, data.bent
-        )
+        usual = data.time.diff(dim=-1).median(-1).values
+        command, begin = self.followed.flatten(0, 1), start.flatten(0, 1)
+        return Drive(data.time, command, begin, self.supply, self.warm, torque, data.bent, usual)
 
     def _moved(self, theta: Tensor, axis: Tensor, rows: Tensor, start: Tensor | None = None) -> Tensor:
         """As `positions`, without what a simulator adds; start: as of `Drive`, of every axis and stretch."""
@@ -215,9 +215,9 @@ class Problem:
     def residual(self, theta: Tensor, axis: Tensor, chosen: Tensor | None = None) -> Tensor:
         """Measured less simulated, as `positions`; finite."""
         measured = self.data.position[axis] if chosen is None else self.data.position[axis[:, None], chosen]
-        far, left = self._far[axis, None, None], measured - self.positions(theta, axis, chosen)
+        far, left = self._far[axis, None, None], measured.sub_(self.positions(theta, axis, chosen))
         # What is no number is far away.
-        return torch.fmax(torch.fmin(left, far), -far)
+        return torch.fmax(torch.fmin(left, far, out=left), -far, out=left)
 
     @cached_property
     def _far(self) -> Tensor:
@@ -228,8 +228,10 @@ class Problem:
         """Means over `pool` samples each, `... x s` -> `... x t`."""
         m = self.pool
         kept = residual[..., : residual.shape[-1] // m * m]
-        found: Tensor = sum((kept[..., k::m] for k in range(1, m)), kept[..., ::m]) / m
-        return found
+        found = kept[..., ::m].clone()
+        for k in range(1, m):
+            found += kept[..., k::m]
+        return found.div_(m)
 
     @cached_property
     def fold(self) -> Tensor:
@@ -258,4 +260,4 @@ class Problem:
     def whitened(self, residual: Tensor, axis: Tensor, whitening: Whitening, chosen: Tensor | None = None) -> Tensor:
         """Whitened means of residuals `p x b x s` of the axes `p` in `unit`, `p x (b t)`; 0 where they do not count."""
         judged = self.judged if chosen is None else self.judged[chosen]
-        return (whitening(self.pooled(residual), axis) * judged).flatten(1) / self.unit[axis, None]
+        return whitening(self.pooled(residual), axis).mul_(judged / self.unit[axis, None, None]).flatten(1)

@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.priors import EFFECT, crowd
-from ccnn_torch.motion.fit import evidences, fit_many, form_errors, products, sensitivities, unseen_errors, weighed
+from ccnn_torch.motion.descent import sensitivities
+from ccnn_torch.motion.fit import evidences, fit_many, form_errors, products, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.servo import TORQUES
-from ccnn_torch.motion.spec import Fit, Spec, started, without
+from ccnn_torch.motion.spec import Fit, Spec, nothing, started, without
 from ccnn_torch.motion.whiten import Whitening, fitted_whitening, white_noise
 
 # Sets that are extended, effects that are fitted for each of them after the screen, and members at most.
@@ -27,8 +28,8 @@ _BEAM, _FITTED, _MOST = 2, 4, 9
 _DIGITS = 3
 # Log posterior that a level must bring.
 _GAINED = 1.0
-# Stretches in which sets are looked for.
-_SCREENED = 16
+# Stretches in which sets are looked for, at first and then.
+_FIRST, _SCREENED = 8, 16
 # Sets that are fitted anew under another noise; and to all stretches, with log posteriors within so much.
 _KEPT, _LIKELY, _WITHIN = 6, 16, 30.0
 _LONG, _SHORT, _FEW = 8, 5, 3
@@ -69,11 +70,15 @@ def search(problem: Problem) -> Search:
     """Find the probable sets of every axis."""
     n, count = len(problem.followed), len(problem.data.run)
     # Sets are looked for in some of the stretches, and fitted to all.
-    few = problem.of(torch.linspace(0, count - 1, _SCREENED).round().long()) if count > _SCREENED else problem
-    plain = _Pool(few, white_noise(n))
+    fewest, few = (
+        problem.of(torch.linspace(0, count - 1, some).round().long()) if count > some else problem
+        for some in (_FIRST, _SCREENED)
+    )
+    plain = _Pool(fewest, white_noise(n))
+    # Before it is whitened a residual has the fewest local optima.
     plain.forward()
     largest = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
-    pool = _Pool(few, fitted_whitening(problem.pooled(largest), problem.judged))
+    pool = _Pool(fewest, fitted_whitening(problem.pooled(largest), problem.judged))
     pool.again(plain)
     pool.forward()
     # The noise of what is left by what is most probable now.
@@ -112,12 +117,11 @@ class _Pool:
         white = problem.whitened(nuisance.flatten(0, 1), problem.axes.repeat(len(nuisance)), whitening)
         self.nuisance = white.reshape(len(nuisance), self.axes, white.shape[-1]).transpose(0, 1)
         self.library: Library = problem.library
-        zero = torch.zeros(self.library.size, dtype=torch.float64)
         # Of noise and form errors of each axis; None: the noise that each set leaves.
         self.variance: list[float] | None = None
         self.scores: list[dict[tuple[float, Members], tuple[float, Fit]]] = [{} for _ in range(self.axes)]
         self.found: list[dict[tuple[int, ...], Fit]] = [{} for _ in range(self.axes)]
-        self.fit([[Spec((), zero, (), 0.0)] for _ in range(self.axes)], 0)
+        self.fit([[nothing(self.library)] for _ in range(self.axes)], 0)
 
     def best(self) -> list[Fit]:
         return [self.scored(i)[0][1] for i in range(self.axes)]
@@ -153,8 +157,10 @@ class _Pool:
         return sorted(found, key=lambda one: (-_level(one[0]), one[1].members))
 
     def fit(self, wanted: Sequence[Sequence[Spec]], steps: int) -> None:
-        """Fit sets of each axis; one that was fitted before stays if it was better."""
-        pairs = [(i, spec) for i, own in enumerate(wanted) for spec in own]
+        """Fit sets of each axis; one that was fitted before stays if it was better, and is left alone where that
+        fit has come to rest."""
+        settled = [{id(fit.spec) for fit in own.values() if fit.settled} for own in self.found]
+        pairs = [(i, spec) for i, own in enumerate(wanted) for spec in own if id(spec) not in settled[i]]
         best = [min((f.rss for f in own.values()), default=math.inf) for own in self.found]
         reached = torch.tensor(best, dtype=torch.float64)
         fits = fit_many(self.problem, self.whitening, pairs, steps, nuisance=self.nuisance, reached=reached)
@@ -164,30 +170,38 @@ class _Pool:
                 self.found[i][fit.members] = fit
 
     def again(self, other: _Pool) -> None:
-        """Fit the most probable sets of another pool under this noise, and every effect alone."""
-        ranked = other.ranked()
-        self.fit([[f.spec for f in fits[:_KEPT] if len(f.members) > 1] for fits in ranked], _LONG)
-        self.fit([[f.spec for f in fits if len(f.members) == 1] for fits in ranked], _FEW)
+        """Fit the most probable sets of another pool under this noise, those of each size, and every effect alone."""
+        wanted = []
+        for fits in other.ranked():
+            by_size = {len(f.members): f.spec for f in reversed(fits) if len(f.members) > 1}
+            several = [*(f.spec for f in fits[:_KEPT] if len(f.members) > 1), *by_size.values()]
+            wanted.append([*{spec.members: spec for spec in several}.values()])
+        self.fit(wanted, _LONG)
+        self.fit([[f.spec for f in fits if len(f.members) == 1] for fits in other.ranked()], _FEW)
 
-    def forward(self) -> None:
-        """Add effects one after the other, as long as that brings evidence."""
+    def forward(self, beam: int = _BEAM, steps: int = _SHORT, fitted: int = _FITTED) -> None:
+        """Add effects one after the other, as long as that brings evidence.
+
+        Args:
+            beam: so many of the most probable sets are extended.
+            steps: as of `fit_many`.
+            fitted: effects that are fitted beside each, those that promise most.
+        """
         done: list[set[tuple[int, ...]]] = [set() for _ in range(self.axes)]
         gains = [True] * self.axes
         for _ in range(_MOST):
             before = [self.scored(i)[0][0] for i in range(self.axes)]
             bases = [
-                [f for f in self.leading(i) if gains[i] and f.members not in done[i] and len(f.members) < _MOST]
+                [f for f in self.leading(i)[:beam] if gains[i] and f.members not in done[i] and len(f.members) < _MOST]
                 for i in range(self.axes)
             ]
             for d, own in zip(done, bases, strict=True):
                 d |= {f.members for f in own}
-            # Alone every effect is fitted: its own share of the gap is told.
-            alone = all(not f.members for own in bases for f in own)
-            self.fit(self.screened(bases, len(self.library.names) if alone else _FITTED), _SHORT)
-            self.fit(
-                [[f.spec for f in self.leading(i) if f.members and own] for i, own in enumerate(bases)],
-                _SHORT,
-            )
+            # Alone, where its own share of the gap is told, and beside one other every effect is fitted.
+            small = all(len(f.members) < 2 for own in bases for f in own)
+            self.fit(self.screened(bases, len(self.library.names) if small else fitted), steps)
+            leading = [self.leading(i)[:beam] if own else [] for i, own in enumerate(bases)]
+            self.fit([[f.spec for f in own if f.members] for own in leading], steps)
             after = [self.scored(i)[0][0] for i in range(self.axes)]
             gains = [a >= b + _GAINED for a, b in zip(after, before, strict=True)]
             if not any(gains):
@@ -195,15 +209,16 @@ class _Pool:
 
     def explored(self) -> list[list[Spec]]:
         """The likely sets of each axis, and every effect alone: sets near those that are the most probable."""
-        self.neighbours()
-        if self.twins():
-            self.neighbours()
         self.reduced()
         likely = self.likely()
         # Sets that are probable although forms are wrong are smaller than those above.
         self.weigh_forms()
-        self.forward()
-        self.neighbours()
+        # No screen is sure: beside the best one every effect is fitted.
+        self.forward(1, _SHORT, len(self.library.names))
+        self.neighbours([True] * self.axes)
+        before = self.best()
+        self.twins()
+        self.neighbours([a.members != b.members for a, b in zip(before, self.best(), strict=True)])
         for own, more, found in zip(likely, self.likely(), self.found, strict=True):
             own |= more | {members: fit.spec for members, fit in found.items() if len(members) == 1}
         self.variance = None
@@ -225,31 +240,33 @@ class _Pool:
             self.variance = [own[0].noise + more for own, more in zip(ranked, form, strict=True)]
         return unseen
 
-    def neighbours(self) -> None:
-        """The most probable set without each of its members, and with another effect in the place of each."""
+    def neighbours(self, going: list[bool]) -> None:
+        """The most probable set without each of its members, and with another effect in the place of each, of some
+        axes."""
         for _ in range(3):
+            if not any(going):
+                return
             before = self.best()
-            self.fit(self.screened(self.fewer([f.spec for f in before], _SHORT)), _SHORT)
+            now = [f.spec if on else nothing(self.library) for f, on in zip(before, going, strict=True)]
+            self.fit(self.screened(self.fewer(now, _SHORT)), _SHORT)
             # What does the same as a member needs the numbers that the others have beside that.
-            pairs = [(i, without(self.library, f.spec, k)) for i, f in enumerate(before) for k in range(len(f.members))]
+            pairs = [(i, without(self.library, s, k)) for i, s in enumerate(now) for k in range(len(s.members))]
             less = fit_many(self.problem, self.whitening, pairs, 0, nuisance=self.nuisance)
             bases = [[fit for (j, _), fit in zip(pairs, less, strict=True) if j == i] for i in range(self.axes)]
             self.fit(self.screened(bases, 1, [{f.members} for f in before]), _SHORT)
-            self.fit([[f.spec for f in self.leading(i)] for i in range(self.axes)], _LONG)
-            if all(a.members == b.members for a, b in zip(before, self.best(), strict=True)):
-                return
+            self.fit([[f.spec for f in self.leading(i) if on] for i, on in enumerate(going)], _LONG)
+            going = [a.members != b.members for a, b in zip(before, self.best(), strict=True)]
 
-    def twins(self) -> bool:
-        """The most probable sets with another gain in the place of an inertia; whether one of them is the best now."""
+    def twins(self) -> None:
+        """The most probable sets with another gain in the place of an inertia."""
         if self.problem.known.get("gain") == 0:
-            return False
-        before, wanted = self.best(), []
+            return
+        wanted = []
         for i, ranked in enumerate(self.ranked()):
             twins = [t for f in ranked[:_KEPT] if (t := with_gain(self.library, i, f.spec)) is not None]
             # Friction that was too large by as much as the inertia is none beside the gain.
             wanted.append([*twins, *(without(self.library, t, k) for t in twins for k in range(len(t.members)))])
         self.fit(wanted, _LONG)
-        return any(a.members != b.members for a, b in zip(before, self.best(), strict=True))
 
     def reduced(self) -> None:
         """The most probable set of each axis without its least members, one after the other, down to none."""
@@ -276,9 +293,12 @@ class _Pool:
         """
         old = self.found if old is None else old
         wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
-        for i, fit in [(i, fit) for i, own in enumerate(bases) for fit in own]:
+        pairs = [(i, fit) for i, own in enumerate(bases) for fit in own]
+        variances = [self.noise_of(i) for i, _ in pairs]
+        promised = promises(self.problem, self.whitening, pairs, self.nuisance, variances)
+        for (i, fit), found in zip(pairs, promised, strict=True):
             scores: dict[int, tuple[float, Variant]] = {}
-            for score, variant in promise(self.problem, self.whitening, i, fit, self.nuisance[i], self.noise_of(i)):
+            for score, variant in found:
                 if variant.effect not in scores or _level(score) > _level(scores[variant.effect][0]):
                     scores[variant.effect] = (score, variant)
             ranked = (v for _, v in sorted(scores.values(), key=lambda item: (-_level(item[0]), item[1].effect)))
@@ -313,44 +333,58 @@ def with_gain(library: Library, axis: int, spec: Spec) -> Spec | None:
     return other
 
 
-def promise(
-    problem: Problem, whitening: Whitening, i: int, base: Fit, nuisance: Tensor, variance: float | None
-) -> list[tuple[float, Variant]]:
+def promises(
+    problem: Problem,
+    whitening: Whitening,
+    bases: Sequence[tuple[int, Fit]],
+    nuisance: Tensor,
+    variances: Sequence[float | None],
+) -> list[list[tuple[float, Variant]]]:
     """For every variant of an effect that an axis can show and a set lacks, the evidence of both together.
 
     Args:
         problem: the data.
         whitening: of the residual.
-        i: the axis.
-        base: its set.
-        nuisance: as of `fit_many`, of this axis.
-        variance: of noise and form errors; None: the noise that each set leaves.
+        bases: axis and set of each.
+        nuisance: as of `fit_many`.
+        variances: for each base, of noise and form errors; None: the noise that each set leaves.
     """
-    library, theta, flat = problem.library, base.spec.theta, list(base.spec.flat)
+    library = problem.library
     variants = [
-        v for own in library.variants for v in own if v.effect not in base.members and bool(library.there[i, v.effect])
+        [v for own in library.variants for v in own if v.effect not in fit.members and bool(library.there[i, v.effect])]
+        for i, fit in bases
     ]
-    if not variants:
+    if not bases:
         return []
-    moved, steps = [], []
-    for v in variants:
-        for a, j in enumerate(v.active):
-            changed, value = theta.clone(), float(v.values[i, a])
+    axis, theta = torch.tensor([i for i, _ in bases]), torch.stack([fit.spec.theta for _, fit in bases])
+    residual, own = sensitivities(problem, whitening, theta, axis, [fit.spec.flat for _, fit in bases])
+    # A row for every number of every variant.
+    rows, moved, steps = [], [], []
+    for b, (i, fit) in enumerate(bases):
+        for variant, a, j in ((v, a, j) for v in variants[b] for a, j in enumerate(v.active)):
+            changed, value = fit.spec.theta.clone(), float(variant.values[i, a])
             steps.append(value if abs(value) > 1e-6 else _STEP)
             changed[j] += steps[-1]
-            changed[list(v.held)] = v.shapes[i]
+            changed[list(variant.held)] = variant.shapes[i]
             moved.append(changed)
-    residual, own = sensitivities(problem, whitening, theta[None], torch.tensor([i]), [flat])
-    axis = torch.full((len(moved),), i)
-    left = problem.whitened(problem.residual(torch.stack(moved), axis), axis, whitening)
-    new = (residual - left) / left.new_tensor(steps)[:, None]
-    x = torch.cat([own[0], new])
-    y = residual[0] + theta[flat] @ own[0]
-    grams = products(x, nuisance, y, float(problem.judged.sum()))
-    ends = torch.tensor([len(v.active) for v in variants]).cumsum(0) + len(flat)
-    sets = [
-        [*base.spec.groups, torch.arange(int(end) - len(v.active), int(end))]
-        for v, end in zip(variants, ends, strict=True)
-    ]
-    scores = weighed(grams, sets, len(x), variance).log_evidence.tolist()
-    return [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, variants, strict=True)]
+            rows.append(b)
+    if not moved:
+        return [[] for _ in bases]
+    at = torch.tensor(rows)
+    left = problem.whitened(problem.residual(torch.stack(moved), axis[at]), axis[at], whitening)
+    new = (residual[at] - left) / left.new_tensor(steps)[:, None]
+    found = []
+    for b, (i, fit) in enumerate(bases):
+        flat = list(fit.spec.flat)
+        x = torch.cat([own[b, : len(flat)], new[at == b]])
+        grams = products(x, nuisance[i], residual[b] + theta[b, flat] @ x[: len(flat)], float(problem.judged.sum()))
+        widths = torch.tensor([len(v.active) for v in variants[b]], dtype=torch.int64)
+        ends = (widths.cumsum(0) + len(flat)).tolist()
+        sets = [
+            [*fit.spec.groups, torch.arange(end - len(v.active), end)] for v, end in zip(variants[b], ends, strict=True)
+        ]
+        scores = weighed(grams, sets, len(x), variances[b]).log_evidence.tolist() if sets else []
+        found.append(
+            [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, variants[b], strict=True)]
+        )
+    return found

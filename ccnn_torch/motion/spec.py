@@ -56,6 +56,7 @@ class Fit(NamedTuple):
         once: largest share of what a member does in one run, which is large of a limit: then these are parts of runs.
         left: mean square of the residual itself [rad^2 or m^2].
         grams: of the linearised model's whitened columns, in plausible sizes, and of `nuisance` after them.
+        settled: whether no step leads further down.
     """
 
     spec: Spec
@@ -67,10 +68,16 @@ class Fit(NamedTuple):
     once: float
     left: float
     grams: Grams
+    settled: bool
 
     @property
     def members(self) -> tuple[int, ...]:
         return self.spec.members
+
+
+def nothing(library: Library) -> Spec:
+    """The set without any effect."""
+    return Spec((), torch.zeros(library.size, dtype=torch.float64), (), 0.0)
 
 
 def started(library: Library, spec: Spec, variant: Variant, axis: int) -> Spec:

@@ -10,47 +10,12 @@ begin, and so is solved with it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.motion.compilable import compilable, pick
-
-ABSENT: dict[str, float] = {
-    "gain": 1.0,
-    "integral": 0.0,
-    "derivative": 0.0,
-    "inertia": 0.0,
-    "load": 0.0,
-    "viscous": 0.0,
-    "drive_damping": 0.0,
-    "coulomb": 0.0,
-    "load_friction": 0.0,
-    "stribeck": 0.0,
-    "stribeck_speed": 0.1,
-    "thermal": 0.0,
-    "gravity_sin": 0.0,
-    "gravity_cos": 0.0,
-    "cogging_sin": 0.0,
-    "cogging_cos": 0.0,
-    "cogging_order": 1.0,
-    "weakness": 0.0,
-    "slowness": 0.0,
-    "ramp": 0.0,
-    "delay": 0.0,
-    "offset": 0.0,
-    "dead_band": 0.0,
-    "supply": 0.0,
-    "play": 0.0,
-    "play_loaded": 0.0,
-    "play_friction": 0.0,
-    "flexibility": 0.0,
-    "flexible_damping": 0.1,
-    "encoder_at_motor": 0.0,
-}
-"""Parameters of an axis and the values of one that follows its command: angles in rad (m of a sliding axis), s, 1."""
 
 Array = NDArray[np.float64]
 GAMMA = 1 - 1 / math.sqrt(2)
@@ -65,8 +30,48 @@ _FASTEST = 1e4
 _AHEAD = (1 - GAMMA) / GAMMA
 
 
+class Given(NamedTuple):
+    """Parameters of axes: angles in rad (m of a sliding axis), s, 1; the values are those of one that follows its
+    command."""
+
+    gain: Any = 1.0
+    integral: Any = 0.0
+    derivative: Any = 0.0
+    inertia: Any = 0.0
+    load: Any = 0.0
+    viscous: Any = 0.0
+    drive_damping: Any = 0.0
+    coulomb: Any = 0.0
+    load_friction: Any = 0.0
+    stribeck: Any = 0.0
+    stribeck_speed: Any = 0.1
+    thermal: Any = 0.0
+    gravity_sin: Any = 0.0
+    gravity_cos: Any = 0.0
+    cogging_sin: Any = 0.0
+    cogging_cos: Any = 0.0
+    cogging_order: Any = 1.0
+    weakness: Any = 0.0
+    slowness: Any = 0.0
+    ramp: Any = 0.0
+    delay: Any = 0.0
+    offset: Any = 0.0
+    dead_band: Any = 0.0
+    supply: Any = 0.0
+    play: Any = 0.0
+    play_loaded: Any = 0.0
+    play_friction: Any = 0.0
+    flexibility: Any = 0.0
+    flexible_damping: Any = 0.1
+    encoder_at_motor: Any = 0.0
+
+
+ABSENT: dict[str, float] = Given()._asdict()
+"""Parameters of an axis and the values of one that follows its command."""
+
+
 class Axis(NamedTuple):
-    """Parameters of axes, as in `ABSENT`, and what follows from them.
+    """Parameters of axes, as in `Given`, and what follows from them.
 
     Attributes:
         weight, hang, wave, phase: sizes and phases of the weight and the cogging: a sine and a cosine of one angle are
@@ -185,62 +190,72 @@ class Sample(NamedTuple):
     warm: Array
 
 
-def axis_of(a: Mapping[str, Array]) -> Axis:
-    """Axes whose parameters are those of `ABSENT`."""
-    weight, hang = wave_of(a["gravity_sin"], a["gravity_cos"])
-    wave, phase = wave_of(a["cogging_sin"], a["cogging_cos"])
+@compilable
+def axis_of(a: Given) -> Axis:
+    """Axes by their parameters."""
+    weight, hang = wave_of(a.gravity_sin, a.gravity_cos)
+    wave, phase = wave_of(a.cogging_sin, a.cogging_cos)
     # Inertia behind a joint: that of the load, or where it is not known all of the axis'.
-    load = np.where(a["load"] > 0, a["load"], a["inertia"])
-    hung = (a["flexibility"] > 0) & (load > 0)
-    stiffness = np.where(hung, load, 0.0) / np.maximum(a["flexibility"], TINY)
+    load = pick(a.load > 0, a.load, a.inertia)
+    hung = 1.0 * ((a.flexibility > 0) & (load > 0))
+    stiffness = hung * load / np.maximum(a.flexibility, TINY)
     # Half of what a derivative gain does resists the speed, within the limit of the motor.
-    damping = a["gain"] * a["derivative"]
+    damping = a.gain * a.derivative
     return Axis(
-        gain=a["gain"],
-        integral=a["integral"],
-        viscous=a["viscous"] + damping,
-        drive_damping=a["drive_damping"] + damping,
-        coulomb=a["coulomb"],
-        load_friction=a["load_friction"],
-        stribeck=a["stribeck"],
-        stribeck_speed=a["stribeck_speed"],
-        thermal=a["thermal"],
-        supply=a["supply"],
-        order=a["cogging_order"],
-        flexibility=a["flexibility"],
-        at_motor=a["encoder_at_motor"],
+        gain=a.gain,
+        integral=a.integral,
+        viscous=a.viscous + damping,
+        drive_damping=a.drive_damping + damping,
+        coulomb=a.coulomb,
+        load_friction=a.load_friction,
+        stribeck=a.stribeck,
+        stribeck_speed=a.stribeck_speed,
+        thermal=a.thermal,
+        supply=a.supply,
+        order=a.cogging_order,
+        flexibility=a.flexibility,
+        at_motor=a.encoder_at_motor,
         weight=weight,
         hang=hang,
         wave=wave,
         phase=phase,
-        limit=1 / np.maximum(a["weakness"], TINY),
-        inertia=np.where(hung, np.maximum(a["inertia"] - load, 0.0), a["inertia"]),
-        hung=hung.astype(float),
+        limit=1 / np.maximum(a.weakness, TINY),
+        inertia=pick(hung > 0, np.maximum(a.inertia - load, 0.0), a.inertia),
+        hung=hung,
         stiffness=stiffness,
-        slack=np.where(hung, 1 / np.maximum(stiffness, TINY), 0.0),
-        drag=2 * a["flexible_damping"] * np.sqrt(np.maximum(a["flexibility"], 0)),
-        whole=a["inertia"],
-        dead_band=a["dead_band"],
-        delay=a["delay"],
-        slowness=a["slowness"],
-        ramp=a["ramp"],
-        derivative=a["derivative"],
+        slack=hung / np.maximum(stiffness, TINY),
+        drag=2 * a.flexible_damping * np.sqrt(np.maximum(a.flexibility, 0.0)),
+        whole=a.inertia,
+        dead_band=a.dead_band,
+        delay=a.delay,
+        slowness=a.slowness,
+        ramp=a.ramp,
+        derivative=a.derivative,
         damping=damping,
-        play=a["play"],
-        play_loaded=a["play_loaded"],
-        play_friction=a["play_friction"],
-        light=np.where(load > 0, 1 / np.maximum(load, TINY), 0.0),
+        play=a.play,
+        play_loaded=a.play_loaded,
+        play_friction=a.play_friction,
+        light=pick(load > 0, 1 / np.maximum(load, TINY), 0.0 * load),
     )
 
 
+@compilable
 def each_has(axis: Axis) -> Has:
     """What each of the axes has."""
-    dry = (axis.coulomb != 0) | (axis.load_friction != 0) | (axis.stribeck != 0)
     return Has(
-        *(axis.integral != 0, dry, axis.load_friction != 0, axis.stribeck != 0, axis.weight != 0, axis.wave != 0),
-        *(axis.flexibility > 0, axis.limit < 1 / TINY, (axis.slowness > 0) | (axis.ramp > 0)),
-        *(axis.derivative != 0, axis.dead_band > 0, axis.play > 0),
-        (axis.play > 0) & (axis.play_loaded > 0),
+        integral=axis.integral != 0,
+        dry=(axis.coulomb != 0) | (axis.load_friction != 0) | (axis.stribeck != 0),
+        load_friction=axis.load_friction != 0,
+        stribeck=axis.stribeck != 0,
+        heavy=axis.weight != 0,
+        waves=axis.wave != 0,
+        soft=axis.flexibility > 0,
+        weak=axis.limit < 1 / TINY,
+        slow=(axis.slowness > 0) | (axis.ramp > 0),
+        led=axis.derivative != 0,
+        dead=axis.dead_band > 0,
+        play=axis.play > 0,
+        hung=(axis.play > 0) & (axis.play_loaded > 0),
     )
 
 
@@ -375,6 +390,7 @@ def _solved(
     return push / resistance
 
 
+@compilable
 def wave_of(sine: Array, cosine: Array) -> tuple[Array, Array]:
     """Size and phase of a sine and a cosine."""
     return np.hypot(sine, cosine), np.arctan2(cosine, sine)

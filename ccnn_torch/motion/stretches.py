@@ -94,17 +94,25 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
 
 
 def smooth_speed(time: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Slope of a parabola through the neighbours of each sample, `s x n` [rad/s]."""
-    from scipy.signal import savgol_filter
-
+    """Slope of a parabola through the neighbours of each sample, `s x n` [rad/s] (Savitzky and Golay 1964)."""
     step = float(np.median(np.diff(time)))
-    width = min(2 * max(round(_WINDOW / step), 2) + 1, (len(time) - 1) // 2 * 2 + 1)
-    if width < 5:
+    half = min(max(round(_WINDOW / step), 2), (len(time) - 1) // 2)
+    if half < 2:
         return np.gradient(position, time, axis=0)
     # Of both, as the steps are not equal.
-    slope: NDArray[np.float64] = savgol_filter(position, width, 2, deriv=1, axis=0)
-    steps: NDArray[np.float64] = savgol_filter(time, width, 2, deriv=1)
-    return np.asarray(slope / steps[:, None])
+    slopes = _slopes(np.column_stack([time, position]), half)
+    return slopes[:, 1:] / slopes[:, :1]
+
+
+def _slopes(values: NDArray[np.float64], half: int) -> NDArray[np.float64]:
+    """Slope for each sample, `s x n`, of the parabola through `half` neighbours on both sides; at the ends of the
+    first and the last one."""
+    place = np.arange(-half, half + 1.0)
+    curved = np.square(place) - np.square(place).mean()
+    windows = np.lib.stride_tricks.sliding_window_view(values, len(place), axis=0)
+    slope, bend = windows @ (place / (place @ place)), 2 * windows[[0, -1]] @ (curved / (curved @ curved))
+    ends = place[:half, None], place[half + 1 :, None]
+    return np.concatenate([slope[0] + ends[0] * bend[0], slope, slope[-1] + ends[1] * bend[1]])
 
 
 def _pieces(time: NDArray[np.float64], rows: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], int]]:

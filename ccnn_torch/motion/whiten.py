@@ -24,8 +24,9 @@ class Whitening(NamedTuple):
     def __call__(self, residual: Tensor, axis: Tensor) -> Tensor:
         """Of residuals `p x b x s` of the axes `p`; the first samples, which lack some before them, are as they are."""
         white = residual.clone()
+        factors = self.coefficients[axis, :, None, None]
         for k in range(1, self.coefficients.shape[1] + 1):
-            white[..., k:] -= self.coefficients[axis, k - 1, None, None] * residual[..., :-k]
+            white[..., k:].addcmul_(factors[:, k - 1], residual[..., :-k], value=-1)
         return white
 
 
