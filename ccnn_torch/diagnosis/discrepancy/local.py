@@ -1,5 +1,5 @@
-"""Discrepancy terms whose place is searched: a bump along a joint or in the workspace, a sine of time, a jump; and the
-product of two drivers, of which neither alone moves a joint so.
+"""Discrepancy terms whose place is searched: a bump along a joint, in time or in the workspace, an edge, a sine of
+time, jumps; and the product of two drivers, of which neither alone moves a joint so.
 
 Bumps of every place at once share one prior scale, and the evidence charges each of them; a dent or a table is in one
 place alone. So that place is searched, and the search is charged as that for a period is.
@@ -34,6 +34,7 @@ from ccnn_torch.diagnosis.discrepancy.smooth import (
     unit_range,
 )
 from ccnn_torch.diagnosis.residual.whitening import Whitening
+from ccnn_torch.display import number_text
 from ccnn_torch.effects import Situation
 
 CROSS = " × "
@@ -89,7 +90,8 @@ class _Ground(NamedTuple):
 def local_discrepancies(
     situation: Situation, jacobian: Tensor, target: Tensor, white: Whitening, others: Tensor
 ) -> list[Atom]:
-    """The best bump of each joint's track and of the workspace; the best jump, sine of time and pair of drivers.
+    """The best bump and edge of each joint's track, and bump of the time and of the workspace; the best jumps, sine of
+    time and pair of drivers.
 
     Args:
         situation: `s` rows.
@@ -113,7 +115,7 @@ def local_discrepancies(
     drivers = [f"joint {joint.name}" for joint in situation.mechanism.joints]
     tracks = unit_range(situation.joints).mT[..., None]
     found = _bump_terms(ground, drivers, tracks, _places(middles, _RADII_ALONG), moved.movedim(-1, 0)[..., None])
-    found += _edge_terms(counted, drivers, tracks[..., 0], moved)
+    found += _edge_terms(counted, situation, tracks[..., 0], moved)
     place = unit_range(situation.place[:, situation.lengths] if situation.lengths else situation.place)
     places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
     # What pulls the platform acts through the joints; what bends a measurement does not.
@@ -161,30 +163,36 @@ def _bump_terms(ground: _Ground, drivers: Sequence[str], points: Tensor, places:
     return made
 
 
-def _edge_terms(ground: _Ground, drivers: Sequence[str], tracks: Tensor, moved: Tensor) -> list[Atom]:
+def _edge_terms(ground: _Ground, situation: Situation, tracks: Tensor, moved: Tensor) -> list[Atom]:
     """Those of the best edge along each joint's track, beyond which it is pulled: a hose goes taut, a stop is touched.
 
     Args:
         ground: what is to be explained.
-        drivers: `n` names.
-        tracks: of all rows, `n x s` in [-1, 1].
+        situation: `s` rows.
+        tracks: of the joints, `n x s` in [-1, 1].
         moved: what each joint's plausible deviation does to the pose, `s x c0 x n` [m, rad].
     """
     grid = torch.linspace(-1, 1, 2 * _ALONG - 1, dtype=moved.dtype)[1:-1]
     made = []
-    for i, (driver, track) in enumerate(zip(drivers, tracks, strict=True)):
-        lead, left = ground.beside(moved[..., i : i + 1])
+    for i, track in enumerate(tracks):
+        columns = moved[..., i : i + 1]
+        lead, left = ground.beside(columns)
         beyond = torch.cat([_beyond(track, grid, side) for side in (1.0, -1.0)])
         ramps = torch.cat([beyond**power for power in _BENDS])
         score = left.gain(TrialColumns(ramps[:, ground.few, None, None], lead))
-        count = (ramps > 0).sum(-1)
-        score = torch.where((count > _TOUCHED) & (count < len(track) - _TOUCHED), score, -torch.inf)
+        touched = (ramps > 0).sum(-1)
+        score = torch.where((touched > _TOUCHED) & (touched < len(track) - _TOUCHED), score, -torch.inf)
         if not bool(torch.isfinite(score).any()):
             continue
-        ramp = ramps[score.argmax()]
-        odds = -search_charge(ground.times * score)
-        columns = moved[..., i : i + 1]
-        made += [discrepancy(driver, columns * (ramp - shift)[:, None, None], odds) for shift in (0.0, ramp.mean())]
+        best, joint, command = int(score.argmax()), situation.mechanism.joints[i], situation.joints[:, i]
+        ramp, odds = ramps[best], -search_charge(ground.times * score)
+        way, where = divmod(best % len(beyond), len(grid))
+        low, high = float(command.min()), float(command.max())
+        edge = low + (high - low) * (float(grid[where]) + 1) / 2
+        note = f"joint {joint.name} is pulled {('above', 'below')[way]} {number_text(edge, 3)} {joint.unit}"
+        # By itself, and about the mean of the rows, as a bump is.
+        both = (columns * (ramp - shift)[:, None, None] for shift in (0.0, ramp.mean()))
+        made += [discrepancy(f"joint {joint.name}", each, odds, note=note) for each in both]
     return made
 
 
