@@ -28,6 +28,7 @@ from ccnn_torch.diagnosis.candidates.nuisance import (
 from ccnn_torch.diagnosis.discrepancy.smooth import (
     carried_moves,
     driver_of,
+    frame_moves,
     joint_moves,
     platform_moves,
     spread_out,
@@ -114,7 +115,13 @@ def local_discrepancies(
     middles = torch.linspace(-1, 1, _ALONG, dtype=moved.dtype).unsqueeze(-1)
     drivers = [f"joint {joint.name}" for joint in situation.mechanism.joints]
     tracks = unit_range(situation.joints).mT[..., None]
-    found = _bump_terms(ground, drivers, tracks, _places(middles, _RADII_ALONG), moved.movedim(-1, 0)[..., None])
+    own = moved.movedim(-1, 0)[..., None]
+    # A bump that is large has its form in the rows that are hardly believed.
+    found = [
+        bump
+        for rows in (ground, counted)
+        for bump in _bump_terms(rows, drivers, tracks, _places(middles, _RADII_ALONG), own)
+    ]
     found += _edge_terms(counted, situation, tracks[..., 0], moved)
     place = unit_range(situation.place[:, situation.lengths] if situation.lengths else situation.place)
     places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
@@ -123,10 +130,10 @@ def local_discrepancies(
     kinds = [moved, platform]
     for raw in [torch.stack(kinds)] if moved.shape == platform.shape else [k[None] for k in kinds]:
         found += _bump_terms(ground, ["workspace"] * len(raw), place.expand(len(raw), -1, -1), places, raw)
-    # A stand that the sun warms for a while comes back.
+    # A stand that the sun warms for a while tilts, and comes back.
     clock = situation.covariates.get("time", torch.arange(len(y), dtype=moved.dtype))
-    clock = unit_range(clock[:, None])[None]
-    found += _bump_terms(ground, ["time"], clock, _places(middles, _RADII_ALONG), platform[None])
+    clock, stand = unit_range(clock[:, None])[None], frame_moves(situation)[None]
+    found += _bump_terms(ground, ["time"], clock, _places(middles, _RADII_ALONG), stand)
     found += _products(ground, situation, moved)
     moving = {"the frame": platform, "several joints": moved}
     moving |= {f"joint {j.name}": moved[..., i : i + 1] for i, j in enumerate(situation.mechanism.joints)}
