@@ -64,7 +64,10 @@ class Backlash(Effect):
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """The machine's weight beside a load that was recorded, and the push that friction holds."""
-        hold = Shape("hold", "1", _HOLDS, usual=_HOLDS[-1]) if situation.directed else Shape("hold", "1", _LOOSE)
+        hold = Shape("hold", "1", _HOLDS, usual=_HOLDS[-1])
+        if not situation.directed:
+            # Of another name: numbers that were found with directions are none without.
+            hold = Shape("edge", "1", _LOOSE, usual=_LOOSE[0])
         balanced = (0.0, *WEIGHTS)
         return (Shape("weight", "N", balanced, usual=PLATFORM_WEIGHT), hold) if situation.loaded else (hold,)
 
