@@ -136,7 +136,9 @@ def diagnose_rows(
         more = replace(situation, covariates={**situation.covariates, **columns})
         other = _judged(more, measured, noise, effects, seed, instrument, (*said.inferred, *columns))
         # Names that could not be asked for before, or a driver that was not there.
-        if said.lacking.keys() & {*other.judgement.names} or any(d.startswith(name) for d in other.judgement.drivers):
+        if {*said.lacking, kind.effect.name} & {*other.judgement.names} or any(
+            d.startswith(name) for d in other.judgement.drivers
+        ):
             said, situation = other, more
     return _diagnosis(said, noise is not None, seed)
 
@@ -241,8 +243,8 @@ def _notes(
     notes += not_held_notes(judgement.names)
     for atom in (analysis.atoms[i] for i in judgement.found.members):
         if atom.note and atom.is_discrepancy:
-            row = "" if atom.begins is None else f" from row {int(chosen[atom.begins]) + 1} on (counted from 1)"
-            notes.append(atom.note + row)
+            rows_of = ", ".join(str(int(chosen[row]) + 1) for row in atom.begins)
+            notes.append(atom.note + (f" from row {rows_of} on (counted from 1)" if rows_of else ""))
     if copies:
         notes.append(f"{copies} rows are exact copies of others and were counted once")
     notes += [shared_text(analysis.correlation)] if analysis.correlation.value else []

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import per_force
-from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
+from ccnn_torch.effects.columns import by_joint, inside, of_rows, one_by_one
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.mechanisms import Mechanism
@@ -17,13 +17,18 @@ from ccnn_torch.mechanisms.frames.set_ups import GIVE
 
 _SCALE = {"m": 1.5e-4, "rad": 2e-4}
 # Pushes at which a joint leaves its flank, in units of the usual one; and how soft the change is.
-_HOLDS = (0.1, 0.2, 0.4, 0.7, 1.2, 2.0, 3.5, 6.0, 60.0)
+_HOLDS = (0.0, 0.1, 0.2, 0.4, 0.7, 1.2, 2.0, 3.5, 6.0, 60.0)
+# Where no direction is known: beyond them a change is in proportion to the load.
+_LOOSE = _HOLDS[1:3]
 _SOFT = 0.3
 _EDGES = ((" softer", 2 * _SOFT), (" harder", 0.5 * _SOFT))
 
 
 class Backlash(Effect):
     """Δq_i = b_i / 2 tanh((w_i / h - s_i) / e) / tanh(1 / e): s the direction of approach, w the push on the joint.
+
+    Without any direction s is 0, and h so small that a load throws the joint from one flank to the other, as it does
+    one whose bolt or bearing is loose.
 
     A joint rests on the flank that drove it, half the backlash b behind the motor's middle, unless weight and load push
     it onto the other flank whichever way it came; friction holds it there up to the push h. The machine's weight and h
@@ -33,13 +38,12 @@ class Backlash(Effect):
 
     name = "backlash"
     kind = "joints"
-    description = "backlash of the drives: the rest position depends on the direction of approach"
+    description = "backlash of the drives: the rest position depends on the direction of approach, or on the load"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """The direction of approach of at least one joint."""
-        there = any(f"direction{i + 1}" in covariates for i in range(len(mechanism.joints)))
-        n = len(mechanism.joints)
-        return "" if there else f"the sign of each joint's last motion before it stopped: direction1[1]…direction{n}[1]"
+        """The direction of approach of at least one joint, or a load that pushes the joints to either flank."""
+        loaded = any(f"load_{c.name}" in covariates for c in inside(mechanism).pose)
+        return "" if loaded else _without_direction(mechanism, covariates)
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Play, and what a softer and a harder edge change, of each joint whose direction is known."""
@@ -54,33 +58,51 @@ class Backlash(Effect):
                 mends=mends,
                 positive=not mends,
             )
-            for j in (situation.mechanism.joints[i] for i in situation.directed)
+            for j in (situation.mechanism.joints[i] for i in _on_either_flank(situation))
             for part, size, mends in parts
         )
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """The machine's weight beside a load that was recorded, and the push that friction holds."""
         hold = Shape("hold", "1", _HOLDS, usual=_HOLDS[-1])
-        return (Shape("weight", "N", WEIGHTS, usual=PLATFORM_WEIGHT), hold) if situation.loaded else (hold,)
+        if not situation.directed:
+            # Of another name: numbers that were found with directions are none without.
+            hold = Shape("edge", "1", _LOOSE, usual=_LOOSE[0])
+        balanced = (0.0, *WEIGHTS)
+        return (Shape("weight", "N", balanced, usual=PLATFORM_WEIGHT), hold) if situation.loaded else (hold,)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x 3 · (joints whose direction is known)`."""
-        return by_joint(self._moves(situation, shape), situation.directed)
+        """`... x s x n x 3 · (joints whose direction is known, or all)`."""
+        return by_joint(self._moves(situation, shape), _on_either_flank(situation))
 
     def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
         """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
 
         rows: which, `t`; None = all. Returns `... x t x m`.
         """
-        return one_by_one(self._moves(situation, shape, rows), situation.directed)
+        return one_by_one(self._moves(situation, shape, rows), _on_either_flank(situation))
 
     def _moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
         weight = shape[..., 0] if situation.loaded else shape.new_tensor(PLATFORM_WEIGHT)
         hold = shape[..., -1, None, None]
-        left = situation.push(weight, rows) / hold - of_rows(situation.direction, rows)
+        # A joint that friction does not hold at all changes its flank as softly as one that it hardly holds.
+        unit = hold.clamp_min(_HOLDS[1])
+        left = (situation.push(weight, rows) - hold * of_rows(situation.direction, rows)) / unit
         rest = _rest(left, _SOFT)
         edges = [_rest(left, soft) - rest for _, soft in _EDGES]
         return torch.stack([rest, *edges], -1)
+
+
+def _without_direction(mechanism: Mechanism, covariates: Sequence[str]) -> str:
+    """What is missing where no direction of approach is among the covariates, as in `missing`."""
+    n = len(mechanism.joints)
+    there = any(f"direction{i + 1}" in covariates for i in range(n))
+    return "" if there else f"the sign of each joint's last motion before it stopped: direction1[1]…direction{n}[1]"
+
+
+def _on_either_flank(situation: Situation) -> list[int]:
+    """Numbers, from 0, of the joints that have columns: those whose direction is known; all, where that is of none."""
+    return situation.directed or [*range(situation.joints.shape[-1])]
 
 
 def _rest(left: Tensor, soft: float) -> Tensor:
@@ -109,7 +131,7 @@ class Friction(Effect):
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """The direction of approach of at least one joint."""
-        return Backlash().missing(mechanism, covariates)
+        return _without_direction(mechanism, covariates)
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """By load (where one was recorded), by weight, constant: for each joint whose direction is known."""

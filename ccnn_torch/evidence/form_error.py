@@ -60,12 +60,15 @@ def with_form_error(dictionary: Dictionary, best: FittedSet, floor: float, is_kn
         return levels
     # Whether the forms are those of the textbook is to be seen where the noise is known: the best set leaves that, and
     # no more.
-    exact, usual = _without_discrepancies(_at_level(dictionary, best, floor, 0.0)), levels[0]
+    every, usual = _at_level(dictionary, best, floor, 0.0), levels[0]
+    exact = _without_discrepancies(every)
     count = dictionary.grams.values
     left, other = (_mean_square(one.found[0], one.dictionary) * one.variance / floor for one in (exact, usual))
     shown = math.log(usual.variance / floor) + other * floor / usual.variance - left
     misfit = max(left - 1 - _SLIGHTLY * math.sqrt(2 / count), 0.0) * count / 2
-    odds = _LOG_EXACT + _SEEN * shown / 2 - misfit
+    # What no effect describes may leave the noise, too, and say it with less.
+    beaten = every.found[0].log_posterior - exact.found[0].log_posterior
+    odds = _LOG_EXACT + _SEEN * shown / 2 - misfit - beaten
     share = 1 / (1 + math.exp(min(-odds, 700.0)))
     return [*(replace(one, weight=one.weight * (1 - share)) for one in levels), replace(exact, weight=share)]
 
@@ -99,7 +102,18 @@ def _at_level(dictionary: Dictionary, best: FittedSet, floor: float, level: floa
     noise = max(floor, _mean_square(best, dictionary))
     variance = max(noise + level * form_error_of(best, dictionary), math.ulp(1.0))
     weighed = with_noise(dictionary, variance)
-    return Posterior(weighed, probable_sets(weighed), 1 / len(LEVELS), variance)
+    found = [replace(f, log_posterior=f.log_posterior - _lacking(weighed, f, level)) for f in probable_sets(weighed)]
+    return Posterior(weighed, sorted(found, key=lambda f: -f.log_posterior), 1 / len(LEVELS), variance)
+
+
+def _lacking(dictionary: Dictionary, found: FittedSet, level: float) -> float:
+    """Log odds against parts that nearly cancel each other: what their forms are wrong by would not cancel, and none of
+    it is left."""
+    yy, squares, beyond = float(dictionary.grams.yy), dictionary.grams.xx.diagonal(), 0.0
+    for i, mean in zip(found.members, found.mean, strict=True):
+        parts = float(mean.square() @ squares[dictionary.groups[i]])
+        beyond += dictionary.atoms[i].form_error * max(parts - yy, 0.0)
+    return _SEEN / 2 * math.log1p(level * beyond)
 
 
 def _without_discrepancies(posterior: Posterior) -> Posterior:

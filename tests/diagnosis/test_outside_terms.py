@@ -25,15 +25,27 @@ def measured(situation: Situation, change: Tensor, times: float, seed: int) -> T
     return still + moved + NOISE * drawn
 
 
-def test_a_jump_of_a_joint_is_named_with_its_row() -> None:
+def test_jumps_of_a_joint_are_named_with_their_rows() -> None:
     situation = rows_of("five_bar", 200, 31)
     change = torch.zeros_like(situation.joints)
-    change[120:, 1] = 1
+    change[60:, 1], change[120:, 1] = 1, -0.8
     found = diagnose_rows(situation, measured(situation, change, 10, 1))
     assert found.verdict["outside_library"] and found.verdict["driver"] == "time" and not found.verdict["effects"]
     note = next(note for note in found.notes if "jump" in note)
-    first = int(note.split("row ")[1].split()[0])
-    assert "a jump of joint q2" in note and abs(first - 121) <= 1
+    first, second = (int(row) for row in note.split("row ")[1].split(" on")[0].split(", "))
+    assert "2 jumps of joint q2" in note and abs(first - 61) <= 1 and abs(second - 121) <= 1
+
+
+def test_a_hose_that_goes_taut_is_no_slow_wave_of_a_gear() -> None:
+    situation = rows_of("five_bar", 100, 32)
+    q = situation.joints[:, 1]
+    edge = float(q.min() + 0.6 * (q.max() - q.min()))
+    change = torch.zeros_like(situation.joints)
+    change[:, 1] = (q - edge).clamp_min(0) ** 2
+    found = diagnose_rows(situation, measured(situation, change, 10, 1))
+    assert found.verdict["drivers"] == ["joint q2"] and not found.verdict["effects"]
+    note = next(note for note in found.notes if "pulled above" in note)
+    assert float(note.split()[-2]) == pytest.approx(edge, abs=0.1)
 
 
 def test_a_product_of_two_drivers_names_both() -> None:

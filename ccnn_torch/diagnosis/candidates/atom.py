@@ -26,7 +26,7 @@ class Atom:
         used: the coefficients that the columns belong to; None = all, in order.
         plain: whether a discrepancy term has straight lines, planes or gentle curves only.
         note: what is to be said of a discrepancy term that was found, without a full stop.
-        begins: the first row that it acts in, counted from 0; None = all.
+        begins: rows from each of which on it is another one, counted from 0; () = it is the same all along.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Atom:
     used: tuple[int, ...] | None = None
     plain: bool = False
     note: str = ""
-    begins: int | None = None
+    begins: tuple[int, ...] = ()
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Those that the columns belong to; () for a discrepancy term."""
@@ -67,7 +67,12 @@ class Atom:
 
 
 def discrepancy(
-    driver: str, columns: Tensor, log_odds: float = 0.0, plain: bool = False, note: str = "", begins: int | None = None
+    driver: str,
+    columns: Tensor,
+    log_odds: float = 0.0,
+    plain: bool = False,
+    note: str = "",
+    begins: tuple[int, ...] = (),
 ) -> Atom:
     """A discrepancy term; log_odds: of it beside the usual one; the others as in `Atom`."""
     return Atom(driver, None, columns.new_zeros(0), columns, OUTSIDE + log_odds, None, plain, note, begins)

@@ -24,7 +24,7 @@ from ccnn_torch.evidence.dictionary import gain_beside
 from ccnn_torch.records.commanded import SECOND
 
 # Speeds are not among them: rows at rest, as most are, have none.
-_KINDS = ("time", "temperature", "load", "direction")
+_KINDS = ("time", "temperature", "direction", "load")
 # A usual row is found among so many.
 _ROWS = 60
 

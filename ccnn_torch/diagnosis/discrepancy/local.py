@@ -1,5 +1,5 @@
-"""Discrepancy terms whose place is searched: a bump along a joint or in the workspace, a sine of time, a jump; and the
-product of two drivers, of which neither alone moves a joint so.
+"""Discrepancy terms whose place is searched: a bump along a joint, in time or in the workspace, an edge, a sine of
+time, jumps; and the product of two drivers, of which neither alone moves a joint so.
 
 Bumps of every place at once share one prior scale, and the evidence charges each of them; a dent or a table is in one
 place alone. So that place is searched, and the search is charged as that for a period is.
@@ -28,12 +28,14 @@ from ccnn_torch.diagnosis.candidates.nuisance import (
 from ccnn_torch.diagnosis.discrepancy.smooth import (
     carried_moves,
     driver_of,
+    frame_moves,
     joint_moves,
     platform_moves,
     spread_out,
     unit_range,
 )
 from ccnn_torch.diagnosis.residual.whitening import Whitening
+from ccnn_torch.display import number_text
 from ccnn_torch.effects import Situation
 
 CROSS = " × "
@@ -41,6 +43,8 @@ CROSS = " × "
 # Places evaluated along a joint's track and in the workspace, and radii as shares of half the range.
 _ALONG, _WITHIN = 21, 40
 _RADII_ALONG, _RADII_WITHIN = (0.1, 0.17, 0.3), (0.25, 0.4, 0.65)
+# Powers of the way beyond an edge.
+_BENDS = (1, 2, 3)
 # Rows that a bump has to touch: fewer are bad rows.
 _TOUCHED = 4.0
 # From a bell to a flat top, and how flat at most (power of the distance).
@@ -58,6 +62,8 @@ _SLOWEST, _ROWS_A_PERIOD, _MOST = 8.0, 3.0, 130.0
 _PERIOD_STEP = 1 / 3
 # Rows before the first possible jump and after the last, and places that are tried, at most.
 _FEWEST_ROWS, _PLACES = 5, 120
+# Jumps of one thing, at most; log evidence for each of its columns that one beside another must bring.
+_MOST_JUMPS, _ONE_MORE = 8, 3.0
 
 
 class _Ground(NamedTuple):
@@ -85,7 +91,8 @@ class _Ground(NamedTuple):
 def local_discrepancies(
     situation: Situation, jacobian: Tensor, target: Tensor, white: Whitening, others: Tensor
 ) -> list[Atom]:
-    """The best bump of each joint's track and of the workspace; the best jump, sine of time and pair of drivers.
+    """The best bump and edge of each joint's track, and bump of the time and of the workspace; the best jumps, sine of
+    time and pair of drivers.
 
     Args:
         situation: `s` rows.
@@ -94,19 +101,28 @@ def local_discrepancies(
         white: noise and weights.
         others: columns of what else is there, in plausible sizes, `s x c0 x P`.
     """
-    # Rows that were set aside count as well, as far as they can be believed: they may be the middle of a bump.
-    white = replace(white, weight=torch.ones_like(white.weight))
     moved = joint_moves(situation, jacobian)
     y = white(target)
-    y = y * (_BELIEVED / torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(_BELIEVED))
     # A place is found in a part of many rows as well.
     few = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))[: _MOST_VALUES // y.shape[1]]
-    ground = _Ground(white, few, NuisanceFit(y[few], white(others)[few]), len(y) / len(few))
+    counted = _Ground(white, few, NuisanceFit(y[few], white(others)[few]), len(y) / len(few))
+    # Rows that were set aside count as well, as far as they can be believed: they may be the middle of a bump.
+    white = replace(white, weight=torch.ones_like(white.weight))
+    y = white(target)
+    y = y * (_BELIEVED / torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(_BELIEVED))
+    ground = _Ground(white, few, NuisanceFit(y[few], white(others)[few]), counted.times)
 
     middles = torch.linspace(-1, 1, _ALONG, dtype=moved.dtype).unsqueeze(-1)
     drivers = [f"joint {joint.name}" for joint in situation.mechanism.joints]
     tracks = unit_range(situation.joints).mT[..., None]
-    found = _bump_terms(ground, drivers, tracks, _places(middles, _RADII_ALONG), moved.movedim(-1, 0)[..., None])
+    own = moved.movedim(-1, 0)[..., None]
+    # A bump that is large has its form in the rows that are hardly believed.
+    found = [
+        bump
+        for rows in (ground, counted)
+        for bump in _bump_terms(rows, drivers, tracks, _places(middles, _RADII_ALONG), own)
+    ]
+    found += _edge_terms(counted, situation, tracks[..., 0], moved)
     place = unit_range(situation.place[:, situation.lengths] if situation.lengths else situation.place)
     places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
     # What pulls the platform acts through the joints; what bends a measurement does not.
@@ -114,6 +130,10 @@ def local_discrepancies(
     kinds = [moved, platform]
     for raw in [torch.stack(kinds)] if moved.shape == platform.shape else [k[None] for k in kinds]:
         found += _bump_terms(ground, ["workspace"] * len(raw), place.expand(len(raw), -1, -1), places, raw)
+    # A stand that the sun warms for a while tilts, and comes back.
+    clock = situation.covariates.get("time", torch.arange(len(y), dtype=moved.dtype))
+    clock, stand = unit_range(clock[:, None])[None], frame_moves(situation)[None]
+    found += _bump_terms(ground, ["time"], clock, _places(middles, _RADII_ALONG), stand)
     found += _products(ground, situation, moved)
     moving = {"the frame": platform, "several joints": moved}
     moving |= {f"joint {j.name}": moved[..., i : i + 1] for i, j in enumerate(situation.mechanism.joints)}
@@ -121,7 +141,7 @@ def local_discrepancies(
     if rotation is not None and float((rotation - rotation[:1]).abs().max()) > _TURNS:
         moving["the tool"] = carried_moves(situation)[..., :3] @ rotation
     if len(y) >= 4 * _FEWEST_ROWS:
-        found += [_jump(ground, what, columns) for what, columns in moving.items()]
+        found += [_jumps(ground, what, columns) for what, columns in moving.items()]
     if "time" in situation.covariates:
         found += _sway(ground, situation.covariates["time"], platform)
     return found
@@ -148,6 +168,44 @@ def _bump_terms(ground: _Ground, drivers: Sequence[str], points: Tensor, places:
         # let it stand for an offset of the joints, which the library knows.
         made += [discrepancy(driver, columns * (bump - shift), -float(charge)) for shift in (0.0, bump.mean(0))]
     return made
+
+
+def _edge_terms(ground: _Ground, situation: Situation, tracks: Tensor, moved: Tensor) -> list[Atom]:
+    """Those of the best edge along each joint's track, beyond which it is pulled: a hose goes taut, a stop is touched.
+
+    Args:
+        ground: what is to be explained.
+        situation: `s` rows.
+        tracks: of the joints, `n x s` in [-1, 1].
+        moved: what each joint's plausible deviation does to the pose, `s x c0 x n` [m, rad].
+    """
+    grid = torch.linspace(-1, 1, 2 * _ALONG - 1, dtype=moved.dtype)[1:-1]
+    made = []
+    for i, track in enumerate(tracks):
+        columns = moved[..., i : i + 1]
+        lead, left = ground.beside(columns)
+        beyond = torch.cat([_beyond(track, grid, side) for side in (1.0, -1.0)])
+        ramps = torch.cat([beyond**power for power in _BENDS])
+        score = left.gain(TrialColumns(ramps[:, ground.few, None, None], lead))
+        touched = (ramps > 0).sum(-1)
+        score = torch.where((touched > _TOUCHED) & (touched < len(track) - _TOUCHED), score, -torch.inf)
+        if not bool(torch.isfinite(score).any()):
+            continue
+        best, joint, command = int(score.argmax()), situation.mechanism.joints[i], situation.joints[:, i]
+        ramp, odds = ramps[best], -search_charge(ground.times * score)
+        way, where = divmod(best % len(beyond), len(grid))
+        low, high = float(command.min()), float(command.max())
+        edge = low + (high - low) * (float(grid[where]) + 1) / 2
+        note = f"joint {joint.name} is pulled {('above', 'below')[way]} {number_text(edge, 3)} {joint.unit}"
+        # By itself, and about the mean of the rows, as a bump is.
+        both = (columns * (ramp - shift)[:, None, None] for shift in (0.0, ramp.mean()))
+        made += [discrepancy(f"joint {joint.name}", each, odds, note=note) for each in both]
+    return made
+
+
+def _beyond(track: Tensor, edges: Tensor, side: float) -> Tensor:
+    """How far rows are beyond each edge, as a share of the way from it to the end, `g x s`."""
+    return (side * (track - edges[:, None])).clamp_min(0) / (1 - side * edges[:, None])
 
 
 def _places(middles: Tensor, radii: tuple[float, ...]) -> Tensor:
@@ -238,8 +296,8 @@ def _waves(share: Tensor, periods: Tensor) -> Tensor:
     return torch.stack([torch.sin(angle), torch.cos(angle)], -1)
 
 
-def _jump(ground: _Ground, what: str, raw: Tensor) -> Atom:
-    """The likeliest jump, its search charged.
+def _jumps(ground: _Ground, what: str, raw: Tensor) -> Atom:
+    """The likeliest jump, and as many more beside it as are worth their search, all of which is charged.
 
     Args:
         ground: what is to be explained.
@@ -247,18 +305,31 @@ def _jump(ground: _Ground, what: str, raw: Tensor) -> Atom:
         raw: columns of a shift of it, `s x c0 x k` [m, rad]; rows in the order measured.
     """
     rows, (lead, left) = len(raw), ground.beside(raw)
-
-    def gain(places: Tensor) -> Tensor:
-        return left.gain(TrialColumns(_steps(ground.few, places)[..., None, None], lead))
-
     step = max(1, -(-(rows - 2 * _FEWEST_ROWS) // _PLACES))
     places = torch.arange(_FEWEST_ROWS, rows - _FEWEST_ROWS, step)
-    score = gain(places)
-    best = int(places[score.argmax()])
-    close = torch.arange(max(best - step + 1, _FEWEST_ROWS), min(best + step, rows - _FEWEST_ROWS))
-    best = int(close[gain(close).argmax()])
-    acting = raw * _steps(torch.arange(rows), torch.tensor([best]))[0][:, None, None]
-    return discrepancy("time", acting, -search_charge(ground.times * score), note=f"a jump of {what}", begins=best)
+    found: list[int] = []
+    charge = 0.0
+    while len(found) < _MOST_JUMPS:
+
+        def gain(places: Tensor, left: NuisanceFit = left) -> Tensor:
+            return left.gain(TrialColumns(_steps(ground.few, places)[..., None, None], lead))
+
+        score = gain(places)
+        own = search_charge(ground.times * score)
+        worth = ground.times * (float(score.max()) - raw.shape[-1]) / 2 - own
+        if found and worth < _ONE_MORE * raw.shape[-1]:
+            break
+        best = int(places[score.argmax()])
+        close = torch.arange(max(best - step + 1, _FEWEST_ROWS), min(best + step, rows - _FEWEST_ROWS))
+        best = int(close[gain(close).argmax()])
+        found, charge = [*found, best], charge + own
+        white = ground.white(raw)[ground.few]
+        left = left.beside(white * _steps(ground.few, torch.tensor([best]))[0][:, None, None])
+    found.sort()
+    steps = _steps(torch.arange(rows), torch.tensor(found))
+    acting = torch.cat([raw * own[:, None, None] for own in steps], -1)
+    note = f"a jump of {what}" if len(found) == 1 else f"{len(found)} jumps of {what}"
+    return discrepancy("time", acting, -charge, note=note, begins=tuple(found))
 
 
 def _steps(number: Tensor, places: Tensor) -> Tensor:

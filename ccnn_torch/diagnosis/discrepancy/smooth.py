@@ -16,6 +16,8 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom, discrepancy
 from ccnn_torch.effects import Situation
+from ccnn_torch.effects.columns import shown_columns
+from ccnn_torch.effects.constant import frame_columns
 from ccnn_torch.evidence.priors import OUTSIDE
 from ccnn_torch.mechanisms import Instrument
 from ccnn_torch.mechanisms.pose import CHANNELS
@@ -214,6 +216,16 @@ def platform_moves(situation: Situation) -> Tensor:
     Of what instruments show each reading by itself.
     """
     return situation.visible * torch.tensor([_SCALE[c.unit] for c in situation.mechanism.channels]).double()
+
+
+def frame_moves(situation: Situation) -> Tensor:
+    """What is seen of shifts and turns of the measuring frame, about the middle of the workspace, `s x c x 6` or fewer;
+    of rows of two places of the platform."""
+    if len(situation.places) > 1:
+        return platform_moves(situation)
+    sizes = torch.tensor([_SCALE["m"]] * 3 + [_SCALE["rad"]] * 3, dtype=torch.float64)
+    shown = shown_columns(situation, frame_columns)
+    return torch.nan_to_num(frame_columns(situation) * sizes)[..., shown]
 
 
 def carried_moves(situation: Situation) -> Tensor:
