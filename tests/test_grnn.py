@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from ccnn_torch.compensation.targets.lowering import recorded
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners import TrainingData, grnn_network as _kernel
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
@@ -181,3 +182,13 @@ def test_rows_that_are_not_finite_are_refused() -> None:
 def test_settings_out_of_range_are_named(keys: dict[str, float], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         GRNNSettings(**keys)  # type: ignore[arg-type]
+
+
+def test_a_file_is_written_from_one_block_however_many_rows_are_stored() -> None:
+    rows = torch.randn(9000, 8, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    targets, weights = rows[:, :2], torch.zeros(9000, dtype=torch.float64)
+    residuals = _kernel.KernelVariance(rows, weights, targets.square(), targets.var(0))
+    network = _kernel.GRNNNetwork(rows, targets, weights, rows.new_ones(8), residuals)
+    for of in (network.forward, network.variance):
+        operations = [str(node.target) for node in recorded(of, [rows[:67]]).graph.nodes]
+        assert operations and not any("split" in name or "cat" in name for name in operations)

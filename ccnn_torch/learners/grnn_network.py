@@ -105,8 +105,9 @@ def blocked_means(
 
 # Rows' worth of belief in the overall variance: a few squared residuals scatter by a factor of several.
 _PRIOR_ROWS = 10.0
-# A power of two: the ONNX exporter rounds numbers in the code to single precision.
 _SMALLEST_VARIANCE = 2.0**-40
+# Rows that are always one block: a file is written from what is done to an example of fewer.
+_ONE_BLOCK = 128
 
 
 class KernelVariance(NamedTuple):
@@ -192,9 +193,9 @@ class GRNNNetwork(nn.Module):
         kernels, nearest = self._kernels(features, self.rows, self.log_weights)
         total = kernels.sum(-1, keepdim=True)
         unsure = noise * (1 + (kernels * kernels).sum(-1, keepdim=True) / (total * total))
-        backed = torch.minimum(torch.exp(nearest) * total, torch.ones_like(total))
+        backed = (torch.exp(nearest) * total).clamp_max(1.0)
         found = unsure + (1 - backed) * self.explained
-        return torch.maximum(found, torch.full_like(found, _SMALLEST_VARIANCE))
+        return found.clamp_min(_SMALLEST_VARIANCE)
 
     def _kernels(self, features: Tensor, rows: Tensor, log_weights: Tensor) -> tuple[Tensor, Tensor]:
         """Kernels of all rows in units of the largest, `... x n`, and its logarithm, `... x 1`."""
@@ -204,9 +205,9 @@ class GRNNNetwork(nn.Module):
         return torch.exp(exponents - nearest), nearest
 
     def _by_blocks(self, of: Callable[[Tensor], Tensor], features: Tensor) -> Tensor:
-        """Any number of rows in bounded memory; one block while the network is traced for a file."""
-        count = max(1, block_size(features) // self.rows.numel())
-        if torch.compiler.is_exporting() or features.shape[:-1].numel() <= count:
+        """Any number of rows in bounded memory."""
+        count = max(_ONE_BLOCK, block_size(features) // self.rows.numel())
+        if features.shape[:-1].numel() <= count:
             return of(features)
         parts = [of(part) for part in torch.split(features.reshape(-1, features.shape[-1]), count)]
         return torch.cat(parts).reshape(*features.shape[:-1], -1)
