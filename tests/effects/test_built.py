@@ -21,7 +21,7 @@ LEFT = [
     ("tripod", "transmission", ["transmission"], 1e-3, 0.3),
     ("arm", "transmission", ["transmission"], 1e-3, 0.3),
     ("tripod", "backlash", ["backlash"], 0.3, 0.15),
-    ("arm", "backlash", ["backlash"], 0.1, 0.3),
+    ("arm", "backlash", ["backlash"], 0.1, 0.2),
     ("tripod", "compliance", ["compliance", "gravity"], 0.045, 0.06),
     ("machine_tool", "compliance", ["compliance", "gravity"], 0.055, 0.15),
     ("arm", "compliance", ["compliance", "gravity"], 0.045, 0.055),
