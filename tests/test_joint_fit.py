@@ -112,6 +112,12 @@ def test_parameters_that_are_not_loose_stay() -> None:
     assert bool((found.parameters[:2] != situation.mechanism.nominal[:2]).all())
 
 
+def test_where_nothing_is_loose_the_machine_stays_as_it_is() -> None:
+    situation = rows(20, 6)
+    found = fit_jointly(situation, measured(situation, [], NOISE), [], torch.ones(20) > 0, [])
+    assert not found.acting and torch.equal(found.parameters, situation.mechanism.nominal)
+
+
 def test_rows_that_are_not_used_change_nothing() -> None:
     situation = rows(120, 1)
     pose, used = measured(situation, [], NOISE), torch.arange(120) < 100

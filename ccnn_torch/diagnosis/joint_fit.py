@@ -89,9 +89,11 @@ def _most_probable(rows: _Rows, at: Tensor, white: Whitening, fit: Fits, measure
     """
     model, groups, begin = rows.model, rows.groups, at
     free = torch.cat([torch.arange(0), *groups])
+    if not len(free):
+        return at, rows
     scales_of = [s.expand(len(g)) for g, s in zip(groups, fit.log_scale[0], strict=True)]
     # What the prior asks of a coefficient, in units of the noise.
-    drawn = (fit.noise[0] / torch.cat([at[:0], *scales_of]).exp()).sqrt()
+    drawn = (fit.noise[0] / torch.cat(scales_of).exp()).sqrt()
     seen = [(at[free], rows)]
 
     def both(values: Tensor) -> tuple[Tensor, Tensor]:
