@@ -202,7 +202,7 @@ def write_report(folder: str | Path, results: RunResults | None = None) -> Path:
     results = RunResults.read(folder / "results.json") if results is None else results
     write_tables(folder, results)
     figures = inline_figures(run_plots(folder, results), folder / "plots")
-    return run_page(results, figures, folder).write_html(folder / "report.html", _LINKED)
+    return run_page(results, figures, Path(folder.name)).write_html(folder / "report.html", _LINKED)
 
 
 def run_plots(folder: str | Path, results: RunResults) -> list[Plot]:

@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any
 
 from ccnn_torch.compensation.targets.machines import klipper_numbers
-from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter, typed_path
+from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter
 from ccnn_torch.files.write import write_rows
 from ccnn_torch.identification.judge import figure_text
 from ccnn_torch.records.formats.klipper import STEPPERS
@@ -479,4 +479,4 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
     results = read_json(folder / "identified.json") if results is None else results
     arrays = load_tensors(folder / ARRAYS_FILE)[0]
     figures = inline_figures(identified_plots(results, arrays), folder / "plots")
-    return identified_page(results, figures, typed_path(str(folder))).write_html(folder / "report.html", _LINKED)
+    return identified_page(results, figures, folder.name).write_html(folder / "report.html", _LINKED)

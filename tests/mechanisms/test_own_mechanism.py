@@ -158,5 +158,5 @@ def test_forward_kinematics_alone_suffices():
     step = jacobian(lambda x: mechanism.solve_inverse(x, None, joints).sum(0), there).movedim(0, 1)
     slope = jacobian(lambda q: mechanism.forward_kinematics(q).sum(0), joints).movedim(0, 1)
     torch.testing.assert_close(step @ slope, torch.eye(3).double().expand(50, -1, -1), rtol=0, atol=1e-8)
-    with pytest.raises(InputError, match=r"solve_inverse\(pose, …\) or forward_kinematics\(joints, …\)"):
+    with pytest.raises(InputError, match="must define closure, solve_inverse or forward_kinematics"):
         type("Nothing", (Mechanism,), {})("nothing", [], [], [], [], [])

@@ -132,8 +132,9 @@ def local_discrepancies(
         found += _bump_terms(ground, ["workspace"] * len(raw), place.expand(len(raw), -1, -1), places, raw)
     # A stand that the sun warms for a while tilts, and comes back.
     clock = situation.covariates.get("time", torch.arange(len(y), dtype=moved.dtype))
-    clock, stand = unit_range(clock[:, None])[None], frame_moves(situation)[None]
-    found += _bump_terms(ground, ["time"], clock, _places(middles, _RADII_ALONG), stand)
+    clock, stand = unit_range(clock[:, None].to(moved.dtype))[None], frame_moves(situation)[None]
+    if stand.shape[-1]:
+        found += _bump_terms(ground, ["time"], clock, _places(middles, _RADII_ALONG), stand)
     found += _products(ground, situation, moved)
     moving = {"the frame": platform, "several joints": moved}
     moving |= {f"joint {j.name}": moved[..., i : i + 1] for i, j in enumerate(situation.mechanism.joints)}

@@ -201,7 +201,7 @@ def _drivers(analysis: Analysis, keep: Tensor) -> Mapping[str, Tensor]:
     if not any(name.startswith("direction") for name in found):
         step = situation.joints[keep].diff(dim=0, prepend=situation.joints[keep][:1])
         found |= {f"direction {i + 1}": torch.where(step[:, i] < 0, -1.0, 1.0).double() for i in range(step.shape[-1])}
-    return {n: unit_range(v[:, None])[:, 0] for n, v in found.items() if float(v.max() - v.min()) > 1e-9}
+    return {n: unit_range(v[:, None].double())[:, 0] for n, v in found.items() if float(v.max() - v.min()) > 1e-9}
 
 
 def _blocks(drivers: Mapping[str, Tensor], channels: int) -> Iterator[_Block]:
