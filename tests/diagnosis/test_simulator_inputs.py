@@ -128,6 +128,7 @@ def test_a_cause_that_nothing_recorded_shows_is_not_passed_off_as_noise() -> Non
     bare = _without(rows, "load", "direction", "time", "temperature")
     guessed = diagnose_rows(bare, poses)
     assert not guessed.verdict["effects"] and guessed.verdict["probability"] <= 0.6
+    assert any("direction1[1]" in " ".join(m["columns"]) for m in guessed.missing_covariates)
     given = diagnose_rows(bare, poses, EXACT)
     assert given.verdict["outside_library"] and not given.verdict["none"]
     assert not any("the noise was not given" in n for n in given.notes)
