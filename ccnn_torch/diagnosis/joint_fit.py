@@ -2,7 +2,8 @@
 
 The model is that of the diagnosis: whitened rows, linear in the coefficients about the machine as fitted so far, each
 group of coefficients with a normal prior whose scale is brought to its most probable value (MacKay 1992). What the
-rows do not show is drawn to 0, so that many effects can be there at once.
+rows do not show is drawn to 0, so that many effects can be there at once. Frames that are not known are as large as
+they have to be: where a machine or a plate stands is no error of it, and what they can do is no evidence.
 """
 
 from __future__ import annotations
@@ -35,9 +36,12 @@ _ROUNDS, _SETTLED = 4, 1e-2
 # Steps of Levenberg and Marquardt at each, at most, the first damping, and the share of the coefficients that a last
 # step may change.
 _STEPS, _DAMPING, _LAST = 12, 1e-8, 0.1
+# Standard deviation of a frame's coordinate where the rows leave it open, in plausible errors; and the share of the
+# largest below which a direction of the frames is one that the rows leave open.
+_ANYWHERE, _OPEN = 1e2, 1e-9
 # Times an effect that may have any period acts, at most: a gear train errs with more than one.
 _TIMES = 2
-_PARAMETERS = "parameters"
+_PARAMETERS, _FRAMES = "parameters", "frames"
 
 
 class JointFit(NamedTuple):
@@ -88,12 +92,13 @@ def _most_probable(rows: _Rows, at: Tensor, white: Whitening, fit: Fits, measure
     the rows hardly show may turn so far that the linear model is no model of it.
     """
     model, groups, begin = rows.model, rows.groups, at
-    free = torch.cat([torch.arange(0), *groups])
+    free = torch.cat([rows.frames, *groups])
     if not len(free):
         return at, rows
-    scales_of = [s.expand(len(g)) for g, s in zip(groups, fit.log_scale[0], strict=True)]
+    scales_of = [s.expand(len(g)) for g, s in zip(groups, fit.log_scale[0], strict=False)]
     # What the prior asks of a coefficient, in units of the noise.
-    drawn = (fit.noise[0] / torch.cat(scales_of).exp()).sqrt()
+    wide = at.new_full((len(rows.frames),), _ANYWHERE**2)
+    drawn = (fit.noise[0] / torch.cat([wide, *(s.exp() for s in scales_of)])).sqrt()
     seen = [(at[free], rows)]
 
     def both(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -239,10 +244,9 @@ class _Model:
             for k in self.known
             for c in k.effect.coefficients(self.situation)
         ]
-        unknown = getattr(self.situation.mechanism, "unknown_frames", ())
-        for p in (self.situation.mechanism.geometry[k] for k in self.loose):
-            frame = p.name.partition("_")[0]
-            found.append((_PARAMETERS, frame if frame in unknown else p.unit))
+        placed = {k for frame in fitted_frames(self.situation) for k in frame}
+        for k in self.loose:
+            found.append((_FRAMES, "") if k in placed else (_PARAMETERS, self.situation.mechanism.geometry[k].unit))
         return found
 
 
@@ -269,7 +273,19 @@ class _Rows:
 
     @property
     def grouped(self) -> dict[tuple[str, str], Tensor]:
-        """The columns of each group that do anything."""
+        """The columns of each group with a prior that do anything."""
+        return {label: group for label, group in self._acting().items() if label[0] != _FRAMES}
+
+    @property
+    def groups(self) -> list[Tensor]:
+        return [*self.grouped.values()]
+
+    @property
+    def frames(self) -> Tensor:
+        """The columns of the frames that do anything."""
+        return self._acting().get((_FRAMES, ""), torch.arange(0))
+
+    def _acting(self) -> dict[tuple[str, str], Tensor]:
         acts = self.columns.abs().amax((0, 1)) > 0
         found: dict[tuple[str, str], list[int]] = {}
         for k, label in enumerate(self.model.labels()):
@@ -277,30 +293,38 @@ class _Rows:
                 found.setdefault(label, []).append(k)
         return {label: torch.tensor(group) for label, group in found.items()}
 
-    @property
-    def groups(self) -> list[Tensor]:
-        return [*self.grouped.values()]
-
     def whitening(self) -> Whitening:
         """Noise from the richest fit; rows that only all effects together explain count as yet."""
         here = self.model.situation
-        columns, channels = [self.columns[..., g] for g in self.groups], moving_channels(here)
+        columns, channels = [self.columns[..., g] for g in self._acting().values()], moving_channels(here)
         white = fitted_whitening(
             self.target, columns, channels, None, self.fine, self.seen, device_axes(here), here.mechanism.channels
         )
-        left = white.picked(self.left) / white.sigma
+        # A plate that stands elsewhere than it was thought makes no outliers of its rows.
+        left = white.picked(self._without_frames(white, self.left[..., None])[0][..., 0]) / white.sigma
         near = inlying(left.norm(dim=-1), self.fine, len(white.channels), 0)
         return replace(white, weight=(self.fine & near)[:, None].expand_as(left).to(left.dtype))
 
     def grams(self, white: Whitening) -> Grams:
-        return grams_of(white(self.columns), white(self.target))._replace(
-            values=white.count(torch.arange(len(self.fine)))
-        )
+        """Inner products of what the frames cannot do."""
+        every, seen = self._without_frames(white, torch.cat([self.columns, self.target[..., None]], -1))
+        values = white.count(torch.arange(len(self.fine))) - seen
+        return grams_of(white(every[..., :-1]), white(every[..., -1]))._replace(values=values)
+
+    def _without_frames(self, white: Whitening, values: Tensor) -> tuple[Tensor, int]:
+        """Values `s x c x m` less what the frames can make of them, and how many of these the rows show."""
+        placed = self.columns[..., self.frames]
+        if not placed.shape[-1]:
+            return values, 0
+        within = white(placed).flatten(0, 1), white(values).flatten(0, 1)
+        found = torch.linalg.lstsq(*within, rcond=_OPEN, driver="gelsd")
+        return values - placed @ found.solution, int(found.rank)
 
     def renewed(self, white: Whitening, fit: Fits, at: Tensor) -> Whitening:
         """Noise and weights from what a fit leaves."""
         values = max(white.count(torch.nonzero(self.fine).squeeze(-1)), 1.0)
-        free = 1 - float(fit.effective[0]) / values
+        placed = self._without_frames(white, self.target[..., None])[1]
+        free = 1 - (float(fit.effective[0]) + placed) / values
         left = white.picked(self.target - self.columns @ at)
         return renewed(white, left, white.picked(self.target), free, self.fine)
 

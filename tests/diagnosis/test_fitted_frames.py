@@ -120,6 +120,21 @@ def test_an_arm_far_from_its_table_is_found_though_two_points_hardly_show_its_ba
     assert float(left) < 2.5e-4
 
 
+def test_where_the_plates_were_thought_to_stand_first_does_not_change_the_arm() -> None:
+    """The frames of plates are as large as they have to be; a prior about a first fit would draw the links along."""
+    situation, pose = _in_sockets(3e-4)
+    assert situation.parameters is not None
+    fine, loose = torch.ones(90, dtype=torch.bool), range(len(situation.mechanism.geometry))
+    away = situation.parameters.clone()
+    away[torch.arange(90) % 3 == 1, :3] += 0.02
+    links = [
+        fit_jointly(replace(situation, parameters=first), pose, [], fine, loose).parameters[0, 6:-6]
+        for first in (situation.parameters, away)
+    ]
+    far = (links[0] - situation.mechanism.nominal[6:-6]).norm()
+    assert float((links[1] - links[0]).norm()) < 0.01 * float(far)
+
+
 def test_an_arm_stands_upright_however_its_plates_stand(sockets: tuple[Situation, Diagnosis]) -> None:
     situation = sockets[0]
     assert situation.parameters is not None
