@@ -26,6 +26,8 @@ _STEEP, _SWINGING = 0.4, 0.05
 _STEEPEST = math.sqrt(2 / math.e)
 # rad/s or m/s: no axis is faster, and no number may overflow.
 _FASTEST = 1e4
+# Seconds for which an axis stood before a log.
+_STOOD = 10.0
 # From the middle stage to where the last one begins.
 _AHEAD = (1 - GAMMA) / GAMMA
 
@@ -111,6 +113,7 @@ class Axis(NamedTuple):
     whole: Array
     dead_band: Array
     delay: Array
+    offset: Array
     slowness: Array
     ramp: Array
     derivative: Array
@@ -228,6 +231,7 @@ def axis_of(a: Given) -> Axis:
         whole=a.inertia,
         dead_band=a.dead_band,
         delay=a.delay,
+        offset=a.offset,
         slowness=a.slowness,
         ramp=a.ramp,
         derivative=a.derivative,
@@ -260,13 +264,20 @@ def each_has(axis: Axis) -> Has:
 
 
 @compilable
-def begun(axis: Axis, q: Array, v: Array, faster: Array, u: Array, push: Array) -> State:
-    """The state of axes whose encoders show `q`, `v` and their acceleration: a spring carries the load's weight, and
-    the integral action what the command `u` does not."""
-    pull = axis.weight * np.sin(q + axis.hang) + push
-    sag = axis.slack * pull
-    load = pull + axis.whole * faster + axis.viscous * v + axis.coulomb * np.sign(v)
-    held = pick(axis.integral > 0, load - axis.gain * (u - q), 0.0 * q)
+def begun(axis: Axis, start: Array, push: Array) -> State:
+    """The state of axes that begin as `start` says (see `Drive`): a spring carries the load's weight, and the integral
+    action held what the command did not when the log began."""
+    q, v, load = start[0], start[1], 0.0 * start[0]
+    sag = axis.slack * (axis.weight * np.sin(q + axis.hang) + push)
+    for k in range(2, 10):
+        load = load + axis.weight * np.sin(start[k] + axis.hang) + axis.wave * np.sin(axis.order * start[k] + axis.phase)
+    load = load / 8 + axis.whole * start[10] + (axis.viscous - axis.damping) * start[11] + axis.coulomb * start[12]
+    added = start[16] + axis.offset * start[17] - axis.delay * start[18]
+    # What is integrated too slowly for that holds nothing.
+    held = 1 - np.exp(-_STOOD * axis.integral)
+    held = held * (load + start[15] - axis.gain * (start[13] + axis.offset - start[14]))
+    held = held + axis.gain * axis.integral * added
+    held = pick(axis.integral > 0, np.minimum(np.maximum(held, -axis.limit), axis.limit), 0.0 * q)
     at_motor = axis.at_motor > 0
     return State(pick(at_motor, q, q + sag), v, pick(at_motor, q - sag, q), v, held)
 
