@@ -79,7 +79,8 @@ class Library(NamedTuple):
         held: place of every shape by the axis' parameter.
         nominal: parameters of the axes, `n` each.
         lacking: of each effect what every axis lacks to show it; "" where one axis can.
-        there: whether an axis can show an effect, `n x effects`.
+        there: whether an axis can show an effect that is tried, `n x effects`.
+        twins: effects that are not tried, since another one does the same to every axis: which one, by their number.
         changes: what a unit of each number does to the axes' parameters: its place, the parameter, how, and by how
             much, `n`.
         about: what is added to each of a simulator's own parameters where it was linearised.
@@ -95,6 +96,7 @@ class Library(NamedTuple):
     nominal: dict[str, Tensor]
     lacking: tuple[str, ...]
     there: Tensor
+    twins: Mapping[int, int]
     changes: tuple[tuple[int, str, str, Tensor], ...]
     about: Mapping[str, float] = {}
 
@@ -246,6 +248,13 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
             -math.log(count) + _RARER.get(effects[e].name, 0.0),
         )
 
+    same: dict[Any, int] = {}
+    acts = [
+        str([[(n.scale, n.start, n.acts) for n in axis[own[0] : own[-1] + 1]] for axis in numbers])
+        + str([[*map(dict, axis)] for axis in shapes[e]] + lacking[e])
+        for e, own in enumerate(places)
+    ]
+    twins = {e: first for e, act in enumerate(acts) if (first := same.setdefault(act, e)) != e}
     counts = [min(map(len, s)) for s in shapes]
     nominal = {
         name: torch.tensor([axis.nominal.get(name, value) for axis in facts], dtype=torch.float64)
@@ -262,7 +271,8 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
         held,
         nominal,
         tuple("" if not all(why) else why[0] for why in lacking),
-        torch.tensor([[not why[i] for why in lacking] for i in range(len(facts))]),
+        torch.tensor([[not why[i] and e not in twins for e, why in enumerate(lacking)] for i in range(len(facts))]),
+        twins,
         tuple(
             (j, act.parameter, act.how, torch.tensor(sizes, dtype=torch.float64))
             for j, number in enumerate(numbers[0])
