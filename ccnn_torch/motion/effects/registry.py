@@ -55,4 +55,5 @@ def motion_effects(names: Sequence[str] | None = None) -> list[MotionEffect]:
             near = nearest(name, list(EFFECTS))
             hint = f"; '{near}' is the nearest" if near else ""
             raise InputError(f"effects: there is no effect of motion '{name}'{hint}; known: {', '.join(EFFECTS)}")
-    return list(found.values())
+    # In the same order always, so that the order in which they are asked for decides no tie.
+    return sorted(found.values(), key=lambda effect: [*EFFECTS, effect.name].index(effect.name))
