@@ -381,7 +381,9 @@ def _parameters(library: Library, axis: int, fit: Fit, effect: int, deviation: T
         sd = float(deviation[flat.index(j)]) * number.scale
         if number.inverse:
             value += facts.nominal.get(number.acts[0][0], 0.0)
-            value, sd = 1 / max(value, _TINY), sd / max(value, _TINY) ** 2
+            if value < _TINY:
+                continue
+            value, sd = 1 / value, sd / value**2
         if all(act.how == "factor" for act in number.acts):
             sd, value = sd * math.exp(value), math.expm1(value)
         found[f"q{axis + 1} {number.name}"] = {

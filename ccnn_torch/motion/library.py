@@ -22,7 +22,7 @@ from ccnn_torch.spelling import nearest
 
 # What may not be below 0, and what not above.
 _POSITIVE = (
-    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "ramp", "play"),
+    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "fading", "slowness", "ramp", "play"),
     *("dead_band", "flexibility", "gain", "integral", "derivative", "supply"),
 )
 # With more damping a spring is no spring; a motor is no stronger than its voltage, but for an error of that.
@@ -37,6 +37,8 @@ _REACH = 0.6
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
 _RARER = dict.fromkeys(("stribeck", "cogging", "dead_band", "acceleration_limit"), math.log(0.1))
+# Of a hundred times at which a zero may have moved those were taken that look most like it.
+_RARER["lost_steps"] = math.log(0.01)
 _SMALLEST = 1e-6
 # Shapes that a fit refines from where they begin.
 _REFINED = ("cogging_order", "stribeck_speed", "flexible_damping", "play_friction")

@@ -42,7 +42,8 @@ KEYS: dict[str, str] = {
     "backlash_friction": "what friction of its own then brakes the load by [rad/s^2]",
     "speed_limit": "of the drive, beyond which it follows no command [rad/s]",
     "acceleration_limit": "of the set point that the drive makes of the commands [rad/s^2]",
-    "torque_limit": "of the motor, at the nominal supply [N*m]",
+    "torque_limit": "of the motor, at the nominal supply and at standstill [N*m]",
+    "no_load_speed": "at which nothing of that is left [rad/s]",
     "supply": "nominal voltage, at which gain and torque_limit hold; given, both go with the column supply[V] [V]",
     "supply_share": "how far they do: 1 where supply is given, 0 not at all [1]",
 }
@@ -68,7 +69,7 @@ _SAME = {
 }
 
 # Limits, of which an axis has one over each.
-_INVERSE = {"speed_limit": "slowness", "acceleration_limit": "ramp"}
+_INVERSE = {"speed_limit": "slowness", "acceleration_limit": "ramp", "no_load_speed": "fading"}
 # Share of an inertia below which a difference of two is none.
 _ROUNDING = 1e-9
 

@@ -20,6 +20,8 @@ from ccnn_torch.motion.compilable import compilable, pick
 Array = NDArray[np.float64]
 GAMMA = 1 - 1 / math.sqrt(2)
 TINY = 1e-9
+NEVER = 1e9
+"""s: later than any log ends."""
 # How steep a wave is followed: shares of what gain and friction, and inertia, resist a motion with within a stage.
 _STEEP, _SWINGING = 0.4, 0.05
 # Largest slope of exp(-x^2).
@@ -54,10 +56,14 @@ class Given(NamedTuple):
     cogging_cos: Any = 0.0
     cogging_order: Any = 1.0
     weakness: Any = 0.0
+    fading: Any = 0.0
     slowness: Any = 0.0
     ramp: Any = 0.0
     delay: Any = 0.0
     offset: Any = 0.0
+    slip: Any = 0.0
+    slip_begin: Any = 0.0
+    slip_end: Any = NEVER
     dead_band: Any = 0.0
     supply: Any = 0.0
     play: Any = 0.0
@@ -78,7 +84,8 @@ class Axis(NamedTuple):
     Attributes:
         weight, hang, wave, phase: sizes and phases of the weight and the cogging: a sine and a cosine of one angle are
             one sine, which is what costs time here.
-        limit: of the motor's torque.
+        limit: of the motor's torque at standstill.
+        line: how fast that falls with the speed.
         inertia: of the motor's side where a load hangs on a spring.
         hung: 1 where it does: a load of no inertia does not pull at the motor, and its weight stays there.
         stiffness, slack, drag: of that spring, one over it, and its damping over it.
@@ -105,6 +112,7 @@ class Axis(NamedTuple):
     wave: Array
     phase: Array
     limit: Array
+    line: Array
     inertia: Array
     hung: Array
     stiffness: Array
@@ -223,6 +231,7 @@ def axis_of(a: Given) -> Axis:
         wave=wave,
         phase=phase,
         limit=1 / np.maximum(a.weakness, TINY),
+        line=pick(a.weakness > TINY, a.fading / np.maximum(a.weakness, TINY), 0.0 * a.fading),
         inertia=pick(hung > 0, np.maximum(a.inertia - load, 0.0), a.inertia),
         hung=hung,
         stiffness=stiffness,
@@ -270,7 +279,9 @@ def begun(axis: Axis, start: Array, push: Array) -> State:
     q, v, load = start[0], start[1], 0.0 * start[0]
     sag = axis.slack * (axis.weight * np.sin(q + axis.hang) + push)
     for k in range(2, 10):
-        load = load + axis.weight * np.sin(start[k] + axis.hang) + axis.wave * np.sin(axis.order * start[k] + axis.phase)
+        load = (
+            load + axis.weight * np.sin(start[k] + axis.hang) + axis.wave * np.sin(axis.order * start[k] + axis.phase)
+        )
     load = load / 8 + axis.whole * start[10] + (axis.viscous - axis.damping) * start[11] + axis.coulomb * start[12]
     added = start[16] + axis.offset * start[17] - axis.delay * start[18]
     # What is integrated too slowly for that holds nothing.
@@ -369,10 +380,10 @@ def _stage(axis: Axis, has: Has, fixed: _Fixed, state: State, u: Array, push: Ar
         friction = friction + axis.stribeck * np.exp(-np.square(v / np.maximum(axis.stribeck_speed, least)))
     speed = _solved(axis, has, free, motor, friction, carried, light, stiff)
     if has.weak:
-        # The part of the damping that the drive makes is within its limit.
-        torque = motor - (stiff + axis.drive_damping) * speed
+        # The part of the damping that the drive makes is within its limit, which falls with the speed.
+        torque = motor - (stiff + axis.drive_damping - axis.line) * speed
         most = np.minimum(np.maximum(torque, -limit), limit)
-        lighter = np.maximum(light - axis.drive_damping, TINY)
+        lighter = np.maximum(light - axis.drive_damping + axis.line, TINY)
         weak = _solved(axis, has, free, most, friction, carried, lighter, 0.0 * most)
         speed = pick(torque == most, speed, weak)
     speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)

@@ -39,7 +39,7 @@ class Stretches(NamedTuple):
     """`n` joints, `b` stretches, `s` samples, padded.
 
     Attributes:
-        time: `b x s` [s], increasing also in the padding.
+        time: `b x s` [s], increasing also in the padding, and from each log to the next.
         command, position: `n x b x s` [rad or m].
         speed: smoothed, `n x b x s`.
         judged: whether a sample counts, `b x s`.
@@ -129,7 +129,11 @@ def _begins(log: Log, part: NDArray[np.int64], stretches: Sequence[int]) -> Iter
     usual = (faster, mean(speed), mean(np.sign(speed)), mean(command), mean(position), np.zeros_like(faster))
     some = position[here][np.linspace(0, len(time[here]) - 1, PLACES).round().astype(int)]
     for k in stretches:
-        since = (wound[k] - mean(wound), time[k] - mean(np.broadcast_to(time[:, None], error.shape)), command[k] - usual[3])
+        since = (
+            wound[k] - mean(wound),
+            time[k] - mean(np.broadcast_to(time[:, None], error.shape)),
+            command[k] - usual[3],
+        )
         yield np.stack([*some, *usual, *since], -1)
 
 
@@ -174,14 +178,19 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
     names = set.intersection(*(set(log.beside) for log in logs))
     time = np.zeros((len(pieces), length))
     command, position, speed = (np.zeros((n, len(pieces), length)) for _ in range(3))
+    # One run after the other, also where each has a clock of its own.
+    shifts, end = [], -np.inf
+    for log in logs:
+        shifts.append(0.0 if log.time[0] > end else end - log.time[0] + 1)
+        end = shifts[-1] + log.time[-1]
     judged = np.zeros((len(pieces), length), dtype=np.bool_)
     place = np.full((len(pieces), length), -1, dtype=np.int64)
     beside = {name: np.zeros((len(pieces), length)) for name in sorted(names)}
     for k, (number, rows, lead) in enumerate(pieces):
         log, m = logs[number], len(rows)
         step = float(np.median(np.diff(log.time[rows])))
-        time[k, :m], place[k, :m] = log.time[rows], rows
-        time[k, m:] = log.time[rows[-1]] + step * np.arange(1, length - m + 1)
+        time[k, :m], place[k, :m] = shifts[number] + log.time[rows], rows
+        time[k, m:] = time[k, m - 1] + step * np.arange(1, length - m + 1)
         judged[k, lead:m] = True
         slope = smooth_speed(log.time[rows], log.position[rows])
         for table, values in ((command, log.command[rows]), (position, log.position[rows]), (speed, slope)):
