@@ -5,11 +5,11 @@ The motor's torque is the gain times (command less position). With everything di
     inertia * q'' = clip(gain * supply * (u - q + integral * I + derivative * (u' - q')), (1 - fading * q') / weakness)
                     - viscous * q' - F(q') * sign(q') - weight(q) - teeth(q)
 
-where u is the command after delay, speed limit and offset, and I the integral of u - q over the time: torques are then
-angles (N m per N m/rad), the inertia is in s^2, the viscous friction in s; a part of that which the drive makes is
-within the limit, too. Within a dead band u - q counts as 0. With all of these 0 the position follows the command
-exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and weight hang on a spring that
-pulls at the motor. Where the zero slips, what encoders show is q and that.
+where u is the command after delay, speed limit, gear ratio and offset, and I the integral of u - q over the time:
+torques are then angles (N m per N m/rad), the inertia is in s^2, the viscous friction in s; a part of that which the
+drive makes is within the limit, too. Within a dead band u - q counts as 0. With all of these 0 the position follows
+the command exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and weight hang on a
+spring that pulls at the motor. Where the zero slips, what encoders show is q and that.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def simulate_axes(
     if bool((delay != 0).any()):
         moved = delayed(drive.time[torch.from_numpy(row)], late, delay[None])[0]
         late = torch.where(delay[:, None] != 0, moved, late)
-    u, step = late.numpy() + a.offset[own, None], np.diff(time)
+    u, step = late.numpy() * (1 + a.ratio[own, None]) + a.offset[own, None], np.diff(time)
     here = (time[row] >= a.slip_begin[own, None]) & (time[row] < a.slip_end[own, None])
     slipped = a.slip[own, None] * here
     found, axis = np.empty((len(run), s)), axis_of(a)

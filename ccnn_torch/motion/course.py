@@ -213,6 +213,7 @@ def courses(
         axis = axis_of(parameters)
         times = time[b % len(time)]
         u = _late(times, command[b], axis.delay) if axis.delay != 0 else command[b].copy()
+        u *= 1 + parameters.ratio
         u += parameters.offset
         pushed, volts, heat = push[b % len(push)], supply[b % len(supply)], warm[b % len(warm)]
         step, has, begin = times[1:] - times[:-1], each_has(axis), start[b].copy()

@@ -36,6 +36,7 @@ KEYS: dict[str, str] = {
     "thermal": "change of coulomb for each kelvin above the coldest sample of the logs, as a share of it [1/K]",
     "delay": "from command to motor [s]",
     "offset": "of the position from the command [rad]",
+    "ratio": "share by which the position goes further than the command, from 0 on [1]",
     "dead_band": "largest error that the drive does nothing about [rad]",
     "backlash": "whole width of the play [rad]",
     "backlash_loaded": "1 where the load moves freely within the play, and its weight presses it to one side [1]",
@@ -51,13 +52,14 @@ KEYS: dict[str, str] = {
 
 TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos"),)
 """Parameters that are torques, which an axis has over the gain."""
-_SIGNED = ("delay", "offset", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
+_SIGNED = ("delay", "offset", "ratio", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
 _SAME = {
     **{
         "integral": "integral",
         "derivative": "derivative",
         "delay": "delay",
         "offset": "offset",
+        "ratio": "ratio",
         "dead_band": "dead_band",
     },
     **{"backlash": "play", "backlash_loaded": "play_loaded"},

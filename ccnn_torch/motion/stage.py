@@ -61,6 +61,7 @@ class Given(NamedTuple):
     ramp: Any = 0.0
     delay: Any = 0.0
     offset: Any = 0.0
+    ratio: Any = 0.0
     slip: Any = 0.0
     slip_begin: Any = 0.0
     slip_end: Any = NEVER
@@ -122,6 +123,7 @@ class Axis(NamedTuple):
     dead_band: Array
     delay: Array
     offset: Array
+    ratio: Array
     slowness: Array
     ramp: Array
     derivative: Array
@@ -241,6 +243,7 @@ def axis_of(a: Given) -> Axis:
         dead_band=a.dead_band,
         delay=a.delay,
         offset=a.offset,
+        ratio=a.ratio,
         slowness=a.slowness,
         ramp=a.ramp,
         derivative=a.derivative,
@@ -283,10 +286,10 @@ def begun(axis: Axis, start: Array, push: Array) -> State:
             load + axis.weight * np.sin(start[k] + axis.hang) + axis.wave * np.sin(axis.order * start[k] + axis.phase)
         )
     load = load / 8 + axis.whole * start[10] + (axis.viscous - axis.damping) * start[11] + axis.coulomb * start[12]
-    added = start[16] + axis.offset * start[17] - axis.delay * start[18]
+    added = start[16] + (axis.offset + axis.ratio * start[13]) * start[17] - axis.delay * start[18]
     # What is integrated too slowly for that holds nothing.
     held = 1 - np.exp(-_STOOD * axis.integral)
-    held = held * (load + start[15] - axis.gain * (start[13] + axis.offset - start[14]))
+    held = held * (load + start[15] - axis.gain * ((1 + axis.ratio) * start[13] + axis.offset - start[14]))
     held = held + axis.gain * axis.integral * added
     held = pick(axis.integral > 0, np.minimum(np.maximum(held, -axis.limit), axis.limit), 0.0 * q)
     at_motor = axis.at_motor > 0

@@ -228,6 +228,17 @@ def test_a_log_that_is_thinned_keeps_the_commands_between_its_samples(tmp_path: 
     assert float(left[:, problem.data.judged].square().mean().sqrt()) < 4e-6
 
 
+def test_a_joint_that_moves_another_share_of_its_command_is_no_weight(tmp_path: Path) -> None:
+    def scaled(time: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        return moved(time, 0.97 * asked)
+
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, scaled)
+    tried = ["joint_gain", "gravity", "offset", "servo_gain"]
+    found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), tried).content
+    assert found["verdict"]["effects"] == ["joint_gain"] and found["verdict"]["probability"] > 0.9
+    assert found["effects"][0]["parameters"]["q1 gain"]["value"] == pytest.approx(-0.03, rel=0.03)
+
+
 def test_a_zero_that_jumps_in_one_run_is_named_with_its_time(tmp_path: Path) -> None:
     log, at = write_log(tmp_path / "log.csv", (0, 1), 2.4), 1.3
     head, *rows = log.read_text().splitlines()

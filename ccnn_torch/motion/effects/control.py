@@ -72,6 +72,9 @@ SERVO_GAIN = MotionEffect("servo_gain", _gains, _either_gain)
 # Position and command differ by a constant.
 OFFSET = MotionEffect("offset", lambda axis: (Number("offset", "joint", 0.02, (add("offset"),), 0.0),))
 
+# The position is another share of the command: an electronic gear, counts per turn, or the range of a calibration.
+JOINT_GAIN = MotionEffect("joint_gain", lambda axis: (Number("gain", "1", 0.01, (add("ratio"),), 0.0),))
+
 # Within it the drive does nothing; without an inertia dry friction does the same.
 DEAD_BAND = MotionEffect(
     "dead_band",
