@@ -2,14 +2,14 @@
 
 The motor's torque is the gain times (command less position). With everything divided by the nominal gain, an axis obeys
 
-    inertia * q'' = clip(gain * supply * (u - q + integral * I + derivative * (u' - q')), 1 / weakness)
+    inertia * q'' = clip(gain * supply * (u - q + integral * I + derivative * (u' - q')), (1 - fading * q') / weakness)
                     - viscous * q' - F(q') * sign(q') - weight(q) - teeth(q)
 
-where u is the command after delay, speed limit and offset, and I the integral of u - q over the time: torques are then
-angles (N m per N m/rad), the inertia is in s^2, the viscous friction in s; a part of that which the drive makes is
-within the limit, too. Within a dead band u - q counts as 0. With all of these 0 the position follows the command
-exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and weight hang on a spring that
-pulls at the motor.
+where u is the command after delay, speed limit, gear ratio and offset, and I the integral of u - q over the time:
+torques are then angles (N m per N m/rad), the inertia is in s^2, the viscous friction in s; a part of that which the
+drive makes is within the limit, too. Within a dead band u - q counts as 0. With all of these 0 the position follows
+the command exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and weight hang on a
+spring that pulls at the motor. Where the zero slips, what encoders show is q and that.
 """
 
 from __future__ import annotations
@@ -32,6 +32,16 @@ Array = NDArray[np.float64]
 _LONGEST, _MOST_PARTS = 0.6, 8
 
 
+PLACES = 8
+START = (
+    *("q0", "v0", *(f"q{k}" for k in range(PLACES)), "acceleration", "speed", "direction", "command", "position"),
+    *("torque", "error", "time", "moved"),
+)
+"""What is known of an axis at the first sample: its position and speed; positions while the log began of which the
+samples are a part, and means over that time, which tell what an integral action held; and from then to the first
+sample the integral of command less position, the time, and how far the command moved."""
+
+
 class Drive(NamedTuple):
     """What an axis is given: one entry for each of `b` runs of an axis, padded to `s` samples.
 
@@ -42,7 +52,7 @@ class Drive(NamedTuple):
         time: `b x s` [s], increasing, also in the padding.
         command: `b x s` [rad or m].
         start: position and speed of the first sample, and its acceleration where it does not begin at rest, `b x 2` or
-            `b x 3`.
+            `b x 3`; or all of `START`, where it begins within a log.
         supply: supply voltage over the nominal one, less 1, `b x s`; None = 0.
         warm: temperature less that of the coldest sample, `b x s` [K]; None = 0.
         torque: what else resists the motor, over the nominal gain, `b x s` [rad or m].
@@ -115,8 +125,7 @@ def simulate_axes(
     usual = np.median(drive.time.diff(dim=-1).numpy(), -1) if drive.usual is None else drive.usual.numpy()
     parts = np.ceil(usual[run % len(usual)] / np.maximum(fast_ones, TINY) / _LONGEST)
     parts = np.clip(parts, 1, _MOST_PARTS).astype(np.int64)
-    start = np.zeros((b, 3))
-    start[:, : drive.start.shape[1]] = drive.start.numpy()
+    start = _start_of(drive)
     bent = np.zeros(1) if drive.bent is None else drive.bent.numpy()
     there = (True, bool(a.supply.any()), bool(a.thermal.any()))
     push, supply, warm = (
@@ -134,7 +143,9 @@ def simulate_axes(
     if bool((delay != 0).any()):
         moved = delayed(drive.time[torch.from_numpy(row)], late, delay[None])[0]
         late = torch.where(delay[:, None] != 0, moved, late)
-    u, step = late.numpy() + a.offset[own, None], np.diff(time)
+    u, step = late.numpy() * (1 + a.ratio[own, None]) + a.offset[own, None], np.diff(time)
+    here = (time[row] >= a.slip_begin[own, None]) & (time[row] < a.slip_end[own, None])
+    slipped = a.slip[own, None] * here
     found, axis = np.empty((len(run), s)), axis_of(a)
     for many in np.unique(parts):
         here = np.flatnonzero(parts == many)
@@ -143,5 +154,20 @@ def simulate_axes(
         one, begin, bend, resists, volts, heat = (
             v[run[here] % len(v)].T for v in (step, start, bent, push, supply, warm)
         )
+        begin[0] -= slipped[here, 0]
         found[here] = course(some, has_any, one, u[here].T.copy(), begin, bend, resists, volts, heat, int(many)).T
-    return torch.from_numpy(found).reshape(*runs.shape, s)
+    return torch.from_numpy(found + slipped).reshape(*runs.shape, s)
+
+
+def _start_of(drive: Drive) -> Array:
+    """All of `START`, `b x 19`: where nothing else is known, the means are those of the first sample."""
+    start = drive.start.numpy()
+    if start.shape[1] == len(START):
+        return start
+    found, (q, v) = np.zeros((len(start), len(START))), start[:, :2].T
+    torque = 0.0 if drive.torque is None else drive.torque[np.arange(len(start)) % len(drive.torque), 0].numpy()
+    faster = start[:, 2] if start.shape[1] > 2 else 0.0
+    means = (faster, v, np.sign(v), drive.command[:, 0].numpy(), q, torque)
+    for k, value in enumerate((q, v, *[q] * PLACES, *means)):
+        found[:, k] = value
+    return found

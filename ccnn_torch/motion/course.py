@@ -33,7 +33,7 @@ def course(
         axis, has: the axes, and what some of them have.
         step: time from each sample to the next, `s - 1` rows.
         u: the command, late and offset already, `s` rows.
-        start: position, speed and acceleration, 3 rows.
+        start: as of `Drive`, a row for each of `START`.
         bent: as of `Drive`, a row.
         push, supply, warm: as of `Drive`; `s` rows, or one where there is nothing.
         parts: into how many every step is divided.
@@ -43,7 +43,7 @@ def course(
         u = _limited(axis, step, u, q, v, push[0])
     if has.led:
         u = _led(axis, step, u)
-    state = begun(axis, q, v, start[2], u[0], push[0])
+    state = begun(axis, start, push[0])
     found, driven = np.empty_like(u), axis.at_motor > 0
     found[0] = pick(driven, state.q, state.x)
     for k in range(len(step)):
@@ -202,7 +202,7 @@ def courses(
         own: which of these each has, `c`.
         run: and which row of those below, which are repeated where there are fewer, `c`.
         time, command: `b x s`.
-        start: `b x 3`.
+        start: `b x len(START)`.
         bent: `b`.
         push, supply, warm: `b x s`, or `1 x 1` where there is nothing.
         parts: into how many the steps are divided, `c`.
@@ -213,8 +213,11 @@ def courses(
         axis = axis_of(parameters)
         times = time[b % len(time)]
         u = _late(times, command[b], axis.delay) if axis.delay != 0 else command[b].copy()
+        u *= 1 + parameters.ratio
         u += parameters.offset
         pushed, volts, heat = push[b % len(push)], supply[b % len(supply)], warm[b % len(warm)]
-        step, has = times[1:] - times[:-1], each_has(axis)
-        found[j] = course(axis, has, step, u, start[b], bent[b % len(bent)], pushed, volts, heat, parts[j])
+        step, has, begin = times[1:] - times[:-1], each_has(axis), start[b].copy()
+        slipped = parameters.slip * ((times >= parameters.slip_begin) & (times < parameters.slip_end))
+        begin[0] -= slipped[0]
+        found[j] = course(axis, has, step, u, begin, bent[b % len(bent)], pushed, volts, heat, parts[j]) + slipped
     return found

@@ -32,7 +32,7 @@ from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.setting import problem_of
-from ccnn_torch.motion.spec import Fit
+from ccnn_torch.motion.spec import Fit, renamed
 from ccnn_torch.motion.stretches import PHASES, Stretches, phases_of
 
 
@@ -219,10 +219,11 @@ def _effects_of(
     # The fits that tell the numbers of each effect: of the verdict, or of the effect alone where none has it.
     shown: list[tuple[int, int, Fit]] = []
     for e in map(library.names.index, alone):
+        tried = library.twins.get(e, e)
         for i, v in enumerate(verdicts):
-            single = () if e in named else (f for f in found.found[i] if f.members == (e,))
-            fit = v.best if e in v.best.members else next(iter(single), None)
-            shown += [] if fit is None else [(e, i, fit)]
+            single = () if tried in named else (f for f in found.found[i] if f.members == (tried,))
+            fit = v.best if tried in v.best.members else next(iter(single), None)
+            shown += [] if fit is None else [(e, i, fit._replace(spec=renamed(library, fit.spec, tried, e)))]
     spread = deviations([fit for *_, fit in shown], [found.found[i][0].noise + found.form[i] for _, i, _ in shown])
     parameters: dict[int, dict[str, Any]] = {}
     for (e, i, fit), own in zip(shown, spread, strict=True):
@@ -230,7 +231,8 @@ def _effects_of(
     rows = []
     for name, gap in alone.items():
         e = library.names.index(name)
-        like = dict.fromkeys(library.names[o] for v in verdicts for o in v.classes.get(e, ()))
+        tried = library.twins.get(e, e)
+        like = dict.fromkeys(library.names[o] for v in verdicts for o in (tried, *v.classes.get(tried, ())) if o != e)
         probability = 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts)
         rows.append(effect_block(name, probability, parameters.get(e, {}), gap, like, {}))
     return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
@@ -379,7 +381,9 @@ def _parameters(library: Library, axis: int, fit: Fit, effect: int, deviation: T
         sd = float(deviation[flat.index(j)]) * number.scale
         if number.inverse:
             value += facts.nominal.get(number.acts[0][0], 0.0)
-            value, sd = 1 / max(value, _TINY), sd / max(value, _TINY) ** 2
+            if value < _TINY:
+                continue
+            value, sd = 1 / value, sd / value**2
         if all(act.how == "factor" for act in number.acts):
             sd, value = sd * math.exp(value), math.expm1(value)
         found[f"q{axis + 1} {number.name}"] = {

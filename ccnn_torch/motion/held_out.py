@@ -67,7 +67,7 @@ def singles(found: Search) -> dict[str, list[Spec]]:
     alone = [{f.members[0]: f.spec for f in fits if len(f.members) == 1} for fits in found.found]
     return {
         name: [own.get(e, nothing(library)) for own in alone]
-        for e, name in enumerate(library.names)
+        for name, e in ((name, library.twins.get(k, k)) for k, name in enumerate(library.names))
         if any(e in own for own in alone)
     }
 

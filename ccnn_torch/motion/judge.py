@@ -11,7 +11,8 @@ position, torque, time, temperature), added to the simulated position or to the 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -117,10 +118,14 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     unseen = {f.members: f.unseen for f in fits}
     sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f)) for f in fits]
     sets += with_drivers(found, axis, drivers, by_members)
-    levels = []
+    levels, twins = [], problem.library.twins
     for level in LEVELS:
         weights = _weights(sets, fits[0].noise, level * found.form[axis], level * OF_SMOOTH)
-        named = [(frozenset(one.members), one.drivers, w, one) for w, one in zip(weights, sets, strict=True)]
+        named = [
+            (names, one.drivers, w, one)
+            for w, one in zip(weights, sets, strict=True)
+            for names in names_of(one.members, twins)
+        ]
         levels.append((1 / len(LEVELS), named))
     explanations = posterior(levels)
     verdict = judge(explanations, explanations, of_classes=True)
@@ -132,7 +137,7 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     if not best.members and not verdict.outside and best.rss > most:
         hidden = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left).members[0]
         doubted = _after_nuisance(best, fits[0].noise) > most
-    marginals = {e: marginal(explanations, e) for e in {e for f in fits for e in f.members}}
+    marginals = {e: marginal(explanations, e) for e in {*(e for f in fits for e in f.members), *twins}}
     driver = verdict.drivers[0] if verdict.outside else None
     return AxisVerdict(best, probability, marginals, verdict.classes, driver, hidden, doubted)
 
@@ -165,6 +170,12 @@ def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float
     whole, beside = (torch.logsumexp(torch.tensor(w, dtype=torch.float64) + least, 0) for w in (weights, smeared))
     pairs = zip(sets, weights, smeared, strict=True)
     return [w if one.rows is None else v + float(whole - beside) for one, w, v in pairs]
+
+
+def names_of(members: Members, twins: Mapping[int, int]) -> Iterator[frozenset[int]]:
+    """The names of a set, and those with effects that do the same in the place of its members."""
+    like = [[m, *(twin for twin, effect in twins.items() if effect == m)] for m in members]
+    return map(frozenset, product(*like))
 
 
 class Candidate(NamedTuple):

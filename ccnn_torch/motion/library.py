@@ -22,7 +22,7 @@ from ccnn_torch.spelling import nearest
 
 # What may not be below 0, and what not above.
 _POSITIVE = (
-    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "ramp", "play"),
+    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "fading", "slowness", "ramp", "play"),
     *("dead_band", "flexibility", "gain", "integral", "derivative", "supply"),
 )
 # With more damping a spring is no spring; a motor is no stronger than its voltage, but for an error of that.
@@ -37,6 +37,8 @@ _REACH = 0.6
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
 _RARER = dict.fromkeys(("stribeck", "cogging", "dead_band", "acceleration_limit"), math.log(0.1))
+# Of a hundred times at which a zero may have moved those were taken that look most like it.
+_RARER["lost_steps"] = math.log(0.01)
 _SMALLEST = 1e-6
 # Shapes that a fit refines from where they begin.
 _REFINED = ("cogging_order", "stribeck_speed", "flexible_damping", "play_friction")
@@ -79,7 +81,8 @@ class Library(NamedTuple):
         held: place of every shape by the axis' parameter.
         nominal: parameters of the axes, `n` each.
         lacking: of each effect what every axis lacks to show it; "" where one axis can.
-        there: whether an axis can show an effect, `n x effects`.
+        there: whether an axis can show an effect that is tried, `n x effects`.
+        twins: effects that are not tried, since another one does the same to every axis: which one, by their number.
         changes: what a unit of each number does to the axes' parameters: its place, the parameter, how, and by how
             much, `n`.
         about: what is added to each of a simulator's own parameters where it was linearised.
@@ -95,6 +98,7 @@ class Library(NamedTuple):
     nominal: dict[str, Tensor]
     lacking: tuple[str, ...]
     there: Tensor
+    twins: Mapping[int, int]
     changes: tuple[tuple[int, str, str, Tensor], ...]
     about: Mapping[str, float] = {}
 
@@ -246,6 +250,13 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
             -math.log(count) + _RARER.get(effects[e].name, 0.0),
         )
 
+    same: dict[Any, int] = {}
+    acts = [
+        str([[(n.scale, n.start, n.acts) for n in axis[own[0] : own[-1] + 1]] for axis in numbers])
+        + str([[*map(dict, axis)] for axis in shapes[e]] + lacking[e])
+        for e, own in enumerate(places)
+    ]
+    twins = {e: first for e, act in enumerate(acts) if (first := same.setdefault(act, e)) != e}
     counts = [min(map(len, s)) for s in shapes]
     nominal = {
         name: torch.tensor([axis.nominal.get(name, value) for axis in facts], dtype=torch.float64)
@@ -262,7 +273,8 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
         held,
         nominal,
         tuple("" if not all(why) else why[0] for why in lacking),
-        torch.tensor([[not why[i] for why in lacking] for i in range(len(facts))]),
+        torch.tensor([[not why[i] and e not in twins for e, why in enumerate(lacking)] for i in range(len(facts))]),
+        twins,
         tuple(
             (j, act.parameter, act.how, torch.tensor(sizes, dtype=torch.float64))
             for j, number in enumerate(numbers[0])

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.shrink import FOLDS
-from ccnn_torch.motion.axis import Drive, simulate_axes
+from ccnn_torch.motion.axis import START, Drive, simulate_axes
 from ccnn_torch.motion.effects.bodies import CARRIED
 from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.known import OF, TIME, share_of
@@ -73,8 +73,8 @@ class Problem:
         return replace(
             self,
             data=data._replace(
-                **{n: some(getattr(data, n)) for n in ("command", "position", "speed")},
-                **{n: some(getattr(data, n), 0) for n in ("time", "judged", "run", "log", "bent")},
+                **{n: some(getattr(data, n)) for n in ("command", "position", "speed", "begin")},
+                **{n: some(getattr(data, n), 0) for n in ("time", "judged", "run", "log", "bent", "part")},
                 beside={name: some(v, 0) for name, v in data.beside.items()},
             ),
             **{n: some(getattr(self, n)) for n in ("followed", "torque", "simulated", "there", "carried")},
@@ -84,8 +84,21 @@ class Problem:
 
     @cached_property
     def _start(self) -> Tensor:
-        faster = (self.data.speed[:, :, 2] - self.data.speed[:, :, 0]) / (self.data.time[:, 2] - self.data.time[:, 0])
-        return torch.stack([self.data.position[:, :, 0], self.data.speed[:, :, 0], faster], -1)
+        data = self.data
+        q, v = data.position[:, :, 0], data.speed[:, :, 0]
+        if data.begin is None:
+            faster = (data.speed[:, :, 2] - v) / (data.time[:, 2] - data.time[:, 0])
+            return torch.stack([q, v, faster], -1)
+        start = torch.cat([torch.stack([q, v], -1), data.begin], -1)
+        if self.torque is not None:
+            start[..., START.index("torque")] = self._usual(self.torque)
+        return start
+
+    def _usual(self, values: Tensor) -> Tensor:
+        """Means over the stretches of the same log, `p x b x s` -> `p x b`."""
+        part, own = self.data.part, values.mean(-1)
+        found = own.new_zeros(len(own), int(part.max()) + 1)
+        return (found.index_add(1, part, own) / part.bincount())[:, part]
 
     def positions(self, theta: Tensor, axis: Tensor, chosen: Tensor | None = None) -> Tensor:
         """Simulated positions of models of axes.
@@ -135,6 +148,8 @@ class Problem:
             position=self.data.position.repeat(1, m, 1),
             bent=None if self.data.bent is None else self.data.bent.repeat(m),
             speed=self.data.speed.repeat(1, m, 1),
+            part=(self.data.part + (int(self.data.part.max()) + 1) * torch.arange(m)[:, None]).flatten(),
+            begin=None if self.data.begin is None else self.data.begin.repeat(1, m, 1),
         )
         wide = replace(
             self,
@@ -205,6 +220,8 @@ class Problem:
             # Each model has runs of its own then.
             at = {name: v[which.flatten() % len(v)] for name, v in drive._asdict().items() if v is not None}
             drive = drive._replace(**at | {"torque": torque.flatten(0, 1)})
+            if drive.start.shape[1] == len(START):
+                drive.start[:, START.index("torque")] += load.mean(-1).flatten()
             which = torch.arange(which.numel()).reshape(which.shape)
         moved = simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
         for name, value in own.items():

@@ -36,13 +36,15 @@ KEYS: dict[str, str] = {
     "thermal": "change of coulomb for each kelvin above the coldest sample of the logs, as a share of it [1/K]",
     "delay": "from command to motor [s]",
     "offset": "of the position from the command [rad]",
+    "ratio": "share by which the position goes further than the command, from 0 on [1]",
     "dead_band": "largest error that the drive does nothing about [rad]",
     "backlash": "whole width of the play [rad]",
     "backlash_loaded": "1 where the load moves freely within the play, and its weight presses it to one side [1]",
     "backlash_friction": "what friction of its own then brakes the load by [rad/s^2]",
     "speed_limit": "of the drive, beyond which it follows no command [rad/s]",
     "acceleration_limit": "of the set point that the drive makes of the commands [rad/s^2]",
-    "torque_limit": "of the motor, at the nominal supply [N*m]",
+    "torque_limit": "of the motor, at the nominal supply and at standstill [N*m]",
+    "no_load_speed": "at which nothing of that is left [rad/s]",
     "supply": "nominal voltage, at which gain and torque_limit hold; given, both go with the column supply[V] [V]",
     "supply_share": "how far they do: 1 where supply is given, 0 not at all [1]",
 }
@@ -50,13 +52,14 @@ KEYS: dict[str, str] = {
 
 TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos"),)
 """Parameters that are torques, which an axis has over the gain."""
-_SIGNED = ("delay", "offset", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
+_SIGNED = ("delay", "offset", "ratio", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
 _SAME = {
     **{
         "integral": "integral",
         "derivative": "derivative",
         "delay": "delay",
         "offset": "offset",
+        "ratio": "ratio",
         "dead_band": "dead_band",
     },
     **{"backlash": "play", "backlash_loaded": "play_loaded"},
@@ -68,7 +71,7 @@ _SAME = {
 }
 
 # Limits, of which an axis has one over each.
-_INVERSE = {"speed_limit": "slowness", "acceleration_limit": "ramp"}
+_INVERSE = {"speed_limit": "slowness", "acceleration_limit": "ramp", "no_load_speed": "fading"}
 # Share of an inertia below which a difference of two is none.
 _ROUNDING = 1e-9
 

@@ -109,3 +109,16 @@ def without(library: Library, spec: Spec, place: int) -> Spec:
         spec.log_prior,
         tuple(p for p in spec.free if p not in held),
     )
+
+
+def renamed(library: Library, spec: Spec, effect: int, other: int) -> Spec:
+    """The set with another effect, of the same numbers, in the place of one."""
+    to = dict(zip(library.places[effect], library.places[other], strict=True))
+    theta = spec.theta.clone()
+    theta[[*to]] = 0.0
+    theta[[*to.values()]] = spec.theta[[*to]]
+    return spec._replace(
+        members=tuple(other if m == effect else m for m in spec.members),
+        theta=theta,
+        active=tuple(tuple(to.get(j, j) for j in group) for group in spec.active),
+    )

@@ -20,12 +20,16 @@ from ccnn_torch.motion.compilable import compilable, pick
 Array = NDArray[np.float64]
 GAMMA = 1 - 1 / math.sqrt(2)
 TINY = 1e-9
+NEVER = 1e9
+"""s: later than any log ends."""
 # How steep a wave is followed: shares of what gain and friction, and inertia, resist a motion with within a stage.
 _STEEP, _SWINGING = 0.4, 0.05
 # Largest slope of exp(-x^2).
 _STEEPEST = math.sqrt(2 / math.e)
 # rad/s or m/s: no axis is faster, and no number may overflow.
 _FASTEST = 1e4
+# Seconds for which an axis stood before a log.
+_STOOD = 10.0
 # From the middle stage to where the last one begins.
 _AHEAD = (1 - GAMMA) / GAMMA
 
@@ -52,10 +56,15 @@ class Given(NamedTuple):
     cogging_cos: Any = 0.0
     cogging_order: Any = 1.0
     weakness: Any = 0.0
+    fading: Any = 0.0
     slowness: Any = 0.0
     ramp: Any = 0.0
     delay: Any = 0.0
     offset: Any = 0.0
+    ratio: Any = 0.0
+    slip: Any = 0.0
+    slip_begin: Any = 0.0
+    slip_end: Any = NEVER
     dead_band: Any = 0.0
     supply: Any = 0.0
     play: Any = 0.0
@@ -76,7 +85,8 @@ class Axis(NamedTuple):
     Attributes:
         weight, hang, wave, phase: sizes and phases of the weight and the cogging: a sine and a cosine of one angle are
             one sine, which is what costs time here.
-        limit: of the motor's torque.
+        limit: of the motor's torque at standstill.
+        line: how fast that falls with the speed.
         inertia: of the motor's side where a load hangs on a spring.
         hung: 1 where it does: a load of no inertia does not pull at the motor, and its weight stays there.
         stiffness, slack, drag: of that spring, one over it, and its damping over it.
@@ -103,6 +113,7 @@ class Axis(NamedTuple):
     wave: Array
     phase: Array
     limit: Array
+    line: Array
     inertia: Array
     hung: Array
     stiffness: Array
@@ -111,6 +122,8 @@ class Axis(NamedTuple):
     whole: Array
     dead_band: Array
     delay: Array
+    offset: Array
+    ratio: Array
     slowness: Array
     ramp: Array
     derivative: Array
@@ -220,6 +233,7 @@ def axis_of(a: Given) -> Axis:
         wave=wave,
         phase=phase,
         limit=1 / np.maximum(a.weakness, TINY),
+        line=pick(a.weakness > TINY, a.fading / np.maximum(a.weakness, TINY), 0.0 * a.fading),
         inertia=pick(hung > 0, np.maximum(a.inertia - load, 0.0), a.inertia),
         hung=hung,
         stiffness=stiffness,
@@ -228,6 +242,8 @@ def axis_of(a: Given) -> Axis:
         whole=a.inertia,
         dead_band=a.dead_band,
         delay=a.delay,
+        offset=a.offset,
+        ratio=a.ratio,
         slowness=a.slowness,
         ramp=a.ramp,
         derivative=a.derivative,
@@ -260,13 +276,22 @@ def each_has(axis: Axis) -> Has:
 
 
 @compilable
-def begun(axis: Axis, q: Array, v: Array, faster: Array, u: Array, push: Array) -> State:
-    """The state of axes whose encoders show `q`, `v` and their acceleration: a spring carries the load's weight, and
-    the integral action what the command `u` does not."""
-    pull = axis.weight * np.sin(q + axis.hang) + push
-    sag = axis.slack * pull
-    load = pull + axis.whole * faster + axis.viscous * v + axis.coulomb * np.sign(v)
-    held = pick(axis.integral > 0, load - axis.gain * (u - q), 0.0 * q)
+def begun(axis: Axis, start: Array, push: Array) -> State:
+    """The state of axes that begin as `start` says (see `Drive`): a spring carries the load's weight, and the integral
+    action held what the command did not when the log began."""
+    q, v, load = start[0], start[1], 0.0 * start[0]
+    sag = axis.slack * (axis.weight * np.sin(q + axis.hang) + push)
+    for k in range(2, 10):
+        load = (
+            load + axis.weight * np.sin(start[k] + axis.hang) + axis.wave * np.sin(axis.order * start[k] + axis.phase)
+        )
+    load = load / 8 + axis.whole * start[10] + (axis.viscous - axis.damping) * start[11] + axis.coulomb * start[12]
+    added = start[16] + (axis.offset + axis.ratio * start[13]) * start[17] - axis.delay * start[18]
+    # What is integrated too slowly for that holds nothing.
+    held = 1 - np.exp(-_STOOD * axis.integral)
+    held = held * (load + start[15] - axis.gain * ((1 + axis.ratio) * start[13] + axis.offset - start[14]))
+    held = held + axis.gain * axis.integral * added
+    held = pick(axis.integral > 0, np.minimum(np.maximum(held, -axis.limit), axis.limit), 0.0 * q)
     at_motor = axis.at_motor > 0
     return State(pick(at_motor, q, q + sag), v, pick(at_motor, q - sag, q), v, held)
 
@@ -358,10 +383,10 @@ def _stage(axis: Axis, has: Has, fixed: _Fixed, state: State, u: Array, push: Ar
         friction = friction + axis.stribeck * np.exp(-np.square(v / np.maximum(axis.stribeck_speed, least)))
     speed = _solved(axis, has, free, motor, friction, carried, light, stiff)
     if has.weak:
-        # The part of the damping that the drive makes is within its limit.
-        torque = motor - (stiff + axis.drive_damping) * speed
+        # The part of the damping that the drive makes is within its limit, which falls with the speed.
+        torque = motor - (stiff + axis.drive_damping - axis.line) * speed
         most = np.minimum(np.maximum(torque, -limit), limit)
-        lighter = np.maximum(light - axis.drive_damping, TINY)
+        lighter = np.maximum(light - axis.drive_damping + axis.line, TINY)
         weak = _solved(axis, has, free, most, friction, carried, lighter, 0.0 * most)
         speed = pick(torque == most, speed, weak)
     speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)

@@ -6,7 +6,7 @@ its end. The folds of a cross-validation are whole runs, or stretches of a run w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
+from ccnn_torch.motion.axis import PLACES
 from ccnn_torch.motion.log import Log
 
 # Seconds of the part that is judged, and of the lead.
@@ -31,11 +32,14 @@ _MOST = 48
 _WINDOW = 0.03
 
 
+Array = NDArray[np.float64]
+
+
 class Stretches(NamedTuple):
     """`n` joints, `b` stretches, `s` samples, padded.
 
     Attributes:
-        time: `b x s` [s], increasing also in the padding.
+        time: `b x s` [s], increasing also in the padding, and from each log to the next.
         command, position: `n x b x s` [rad or m].
         speed: smoothed, `n x b x s`.
         judged: whether a sample counts, `b x s`.
@@ -45,6 +49,9 @@ class Stretches(NamedTuple):
         units: of the joints.
         notes: what was left out, one sentence each without a full stop.
         bent: as of `Drive`; None where no log was thinned.
+        part: which part of a log without gaps each is of, `b`.
+        begin: `START` of each stretch but for its position and speed, the torque 0, `n x b x 17`; None where nothing
+            is known beyond its samples.
     """
 
     time: Tensor
@@ -57,6 +64,8 @@ class Stretches(NamedTuple):
     log: Tensor
     units: tuple[str, ...]
     notes: tuple[str, ...]
+    part: Tensor
+    begin: Tensor | None
     bent: Tensor | None = None
 
 
@@ -67,6 +76,8 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
         InputError: no part with the drive on is long enough.
     """
     pieces: list[tuple[int, NDArray[np.int64], int]] = []
+    parts: list[int] = []
+    means: list[Array] = []
     notes = [note for log in logs for note in log.notes]
     strides = []
     for number, log in enumerate(logs):
@@ -77,7 +88,10 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
         ends = np.flatnonzero(log.cut | np.diff(log.on, prepend=log.on[:1]))
         for part in np.split(np.arange(len(log.time)), ends):
             rows = part[::stride]
-            pieces += [(number, *piece) for piece in _pieces(log.time[rows], rows) if log.on[part].all()]
+            found = _pieces(log.time[rows], rows) if log.on[part].all() else []
+            pieces += [(number, *piece) for piece in found]
+            parts += [max(parts, default=-1) + 1] * len(found)
+            means += [*_begins(log, part, [rows[0] - part[0] for rows, _ in found])] if found else []
     if not pieces:
         raise InputError(
             f"{', '.join(log.name for log in logs)}: no part with the drive on and without gaps lasts "
@@ -87,13 +101,43 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
         notes.append(f"one sample in {max(strides)} was evaluated, one in {_STEP * 1e3:.0f} ms or so")
     if len(pieces) > _MOST:
         notes.append(f"{_MOST} of {count_text(len(pieces), 'stretch')}, spread evenly over the logs, were evaluated")
-        pieces = [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, _MOST).round().astype(int))]
+        kept = np.unique(np.linspace(0, len(pieces) - 1, _MOST).round().astype(int))
+        pieces, parts, means = ([some[i] for i in kept] for some in (pieces, parts, means))
     # A command is a straight line between the samples of the log, not between those that are left.
     bent = torch.tensor([1 - strides[number] ** -2 for number, _, _ in pieces], dtype=torch.float64)
-    return _padded(logs, pieces, notes)._replace(bent=bent if max(strides) > 1 else None)
+    begin = torch.from_numpy(np.stack(means, 1))
+    return _padded(logs, pieces, notes)._replace(
+        bent=bent if max(strides) > 1 else None, part=torch.tensor(parts), begin=begin
+    )
 
 
-def smooth_speed(time: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _begins(log: Log, part: NDArray[np.int64], stretches: Sequence[int]) -> Iterator[Array]:
+    """`begin` of stretches that begin at these samples of a part of a log, `n x 17` each."""
+    time, command, position = log.time[part], log.command[part], log.position[part]
+    speed, error = smooth_speed(time, position), command - position
+    steps = np.diff(time)[:, None]
+    wound = np.concatenate([np.zeros_like(error[:1]), np.cumsum(0.5 * steps * (error[1:] + error[:-1]), 0)])
+    # Not from the very first sample on, where a speed is known worst.
+    first, last = (int(np.searchsorted(time, time[0] + t)) for t in (_WINDOW, _WINDOW + _LEAD))
+    here = slice(first, max(last, first + 2))
+    over = time[here][-1] - time[first]
+
+    def mean(values: Array) -> Array:
+        return np.trapezoid(values[here], time[here], axis=0) / over
+
+    faster = (speed[here][-1] - speed[first]) / over
+    usual = (faster, mean(speed), mean(np.sign(speed)), mean(command), mean(position), np.zeros_like(faster))
+    some = position[here][np.linspace(0, len(time[here]) - 1, PLACES).round().astype(int)]
+    for k in stretches:
+        since = (
+            wound[k] - mean(wound),
+            time[k] - mean(np.broadcast_to(time[:, None], error.shape)),
+            command[k] - usual[3],
+        )
+        yield np.stack([*some, *usual, *since], -1)
+
+
+def smooth_speed(time: Array, position: Array) -> Array:
     """Slope of a parabola through the neighbours of each sample, `s x n` [rad/s] (Savitzky and Golay 1964)."""
     step = float(np.median(np.diff(time)))
     half = min(max(round(_WINDOW / step), 2), (len(time) - 1) // 2)
@@ -104,7 +148,7 @@ def smooth_speed(time: NDArray[np.float64], position: NDArray[np.float64]) -> ND
     return slopes[:, 1:] / slopes[:, :1]
 
 
-def _slopes(values: NDArray[np.float64], half: int) -> NDArray[np.float64]:
+def _slopes(values: Array, half: int) -> Array:
     """Slope for each sample, `s x n`, of the parabola through `half` neighbours on both sides; at the ends of the
     first and the last one."""
     place = np.arange(-half, half + 1.0)
@@ -115,7 +159,7 @@ def _slopes(values: NDArray[np.float64], half: int) -> NDArray[np.float64]:
     return np.concatenate([slope[0] + ends[0] * bend[0], slope, slope[-1] + ends[1] * bend[1]])
 
 
-def _pieces(time: NDArray[np.float64], rows: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], int]]:
+def _pieces(time: Array, rows: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], int]]:
     """Rows of each stretch with its lead, and the number of samples of the lead."""
     if len(time) < 8 or time[-1] - time[0] < _LEAD + _SHORTEST:
         return []
@@ -134,14 +178,19 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
     names = set.intersection(*(set(log.beside) for log in logs))
     time = np.zeros((len(pieces), length))
     command, position, speed = (np.zeros((n, len(pieces), length)) for _ in range(3))
+    # One run after the other, also where each has a clock of its own.
+    shifts, end = [], -np.inf
+    for log in logs:
+        shifts.append(0.0 if log.time[0] > end else end - log.time[0] + 1)
+        end = shifts[-1] + log.time[-1]
     judged = np.zeros((len(pieces), length), dtype=np.bool_)
     place = np.full((len(pieces), length), -1, dtype=np.int64)
     beside = {name: np.zeros((len(pieces), length)) for name in sorted(names)}
     for k, (number, rows, lead) in enumerate(pieces):
         log, m = logs[number], len(rows)
         step = float(np.median(np.diff(log.time[rows])))
-        time[k, :m], place[k, :m] = log.time[rows], rows
-        time[k, m:] = log.time[rows[-1]] + step * np.arange(1, length - m + 1)
+        time[k, :m], place[k, :m] = shifts[number] + log.time[rows], rows
+        time[k, m:] = time[k, m - 1] + step * np.arange(1, length - m + 1)
         judged[k, lead:m] = True
         slope = smooth_speed(log.time[rows], log.position[rows])
         for table, values in ((command, log.command[rows]), (position, log.position[rows]), (speed, slope)):
@@ -159,6 +208,8 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
         log=torch.from_numpy(place),
         units=logs[0].units,
         notes=tuple(notes),
+        part=torch.zeros(0, dtype=torch.int64),
+        begin=None,
     )
 
 

@@ -78,7 +78,7 @@ def test_the_command_on_a_real_servo(tmp_path: Path, cli: Cli) -> None:
     assert (out / "diagnosis.md").is_file()
 
 
-def test_rounding_decides_no_verdict_on_a_real_servo() -> None:
+def test_neither_rounding_nor_the_order_of_effects_decides_a_verdict_on_a_real_servo() -> None:
     logs = load_logs([DATA / f"servo_{name}.csv" for name in ("sin_sin", "up_and_down")])
     nominal, said, ripples = nominal_of("servo", {}, ["rad"]), [], []
     for seed in (0, 1):
@@ -86,7 +86,8 @@ def test_rounding_decides_no_verdict_on_a_real_servo() -> None:
         moved = [replace(log, command=log.command * (1 + 2e-16 * signs[: len(log.time), None])) for log in logs]
         ripples.append(problem_of(moved, nominal, motion_effects(["cogging"])).library.facts[0].ripples)
         # A lag is a gain or viscous friction: the two tie.
-        said.append(diagnose_motion(moved, nominal, ["gravity", "servo_gain", "viscous", "stribeck"]).content)
+        tried = ["gravity", "servo_gain", "viscous", "stribeck"]
+        said.append(diagnose_motion(moved, nominal, tried[:: 1 - 2 * seed]).content)
     assert ripples[0] == ripples[1] != ()
     first, second = said
     assert first["verdict"]["effects"] == second["verdict"]["effects"] != []
@@ -225,6 +226,53 @@ def test_a_log_that_is_thinned_keeps_the_commands_between_its_samples(tmp_path: 
     problem = problem_of(load_logs([tmp_path / "log.csv"]), nominal, motion_effects(["delay"]))
     left = problem.residual(torch.zeros(1, problem.library.size, dtype=torch.float64), problem.axes)
     assert float(left[:, problem.data.judged].square().mean().sqrt()) < 4e-6
+
+
+def test_a_joint_that_moves_another_share_of_its_command_is_no_weight(tmp_path: Path) -> None:
+    def scaled(time: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        return moved(time, 0.97 * asked)
+
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, scaled)
+    tried = ["joint_gain", "gravity", "offset", "servo_gain"]
+    found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), tried).content
+    assert found["verdict"]["effects"] == ["joint_gain"] and found["verdict"]["probability"] > 0.9
+    assert found["effects"][0]["parameters"]["q1 gain"]["value"] == pytest.approx(-0.03, rel=0.03)
+
+
+def test_a_zero_that_jumps_in_one_run_is_named_with_its_time(tmp_path: Path) -> None:
+    log, at = write_log(tmp_path / "log.csv", (0, 1), 2.4), 1.3
+    head, *rows = log.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    lines = [f"{t},{r},{u},{float(q) + 0.05 * (r == '0' and float(t) > at)!r}" for t, r, u, q in cells]
+    log.write_text("\n".join([head, *lines]) + "\n")
+    tried = ["lost_steps", "offset", "coulomb"]
+    found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), tried).content
+    assert found["verdict"]["effects"] == ["lost_steps"] and found["verdict"]["probability"] > 0.9
+    values = {n: v["value"] for n, v in found["effects"][0]["parameters"].items()}
+    assert values["q1 jump"] == pytest.approx(0.05, rel=0.02)
+    # Up to the end of the run, and no more.
+    assert values["q1 slip_begin"] == pytest.approx(at, abs=0.03) and 2.3 < values["q1 slip_end"] < 3.8
+
+
+def test_a_limit_that_falls_with_the_speed_is_told_with_the_speed_at_which_it_is_none(tmp_path: Path) -> None:
+    def limited(time: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        # A direct-current motor without torque at 2.5 rad/s, in 40 steps for each sample.
+        step, q, v, found = 0.01 / 40, asked[0], 0.0, []
+        for u, after in zip(asked, [*asked[1:], asked[-1]], strict=True):
+            found.append(q)
+            for k in range(40):
+                torque = GAIN * (u + (after - u) * k / 40 - q)
+                torque = min(max(torque, -0.25 * (1 + v / 2.5)), 0.25 * (1 - v / 2.5))
+                v += step * (torque - VISCOUS * v) / INERTIA
+                q += step * v
+        return np.array(found)
+
+    write_log(tmp_path / "log.csv", (0, 2), 3.0, limited)
+    tried = ["saturation", "speed_limit", "viscous"]
+    found = diagnose_motion(load_logs([tmp_path / "log.csv"]), nominal_of("servo", KEYS, ["rad"]), tried).content
+    assert found["verdict"]["effects"] == ["saturation"] and found["verdict"]["probability"] > 0.9
+    values = {n: v["value"] for n, v in found["effects"][0]["parameters"].items()}
+    assert values == pytest.approx({"q1 torque": 0.25, "q1 speed without torque": 2.5}, rel=0.05)
 
 
 def test_cogging_of_many_poles_is_named_with_its_order(tmp_path: Path) -> None:

@@ -72,6 +72,9 @@ SERVO_GAIN = MotionEffect("servo_gain", _gains, _either_gain)
 # Position and command differ by a constant.
 OFFSET = MotionEffect("offset", lambda axis: (Number("offset", "joint", 0.02, (add("offset"),), 0.0),))
 
+# The position is another share of the command: an electronic gear, counts per turn, or the range of a calibration.
+JOINT_GAIN = MotionEffect("joint_gain", lambda axis: (Number("gain", "1", 0.01, (add("ratio"),), 0.0),))
+
 # Within it the drive does nothing; without an inertia dry friction does the same.
 DEAD_BAND = MotionEffect(
     "dead_band",
@@ -86,11 +89,21 @@ INTEGRAL_ACTION = MotionEffect(
     lambda axis: [{"integral gain": start} for start in (0.3, 3.0)],
 )
 
-# A limit of the motor's torque.
+# A limit of the motor's torque, which falls with the speed as its voltage does not suffice for more.
 SATURATION = MotionEffect(
     "saturation",
-    lambda axis: (Number("torque", "torque", 2 / axis.error, (add("weakness"),), inverse=True),),
+    lambda axis: (
+        Number("torque", "torque", 2 / axis.error, (add("weakness"),), inverse=True),
+        Number("speed without torque", "speed", 0.3 / axis.speed, (add("fading"),), 0.0, inverse=True),
+    ),
     lambda axis: [{"torque": 1 / (share * axis.error)} for share in (0.3, 0.6, 0.9)],
+)
+
+# The zero jumps at a time: a stepper that loses steps, a belt that slips; until the end of the run, or from then on.
+LOST_STEPS = MotionEffect(
+    "lost_steps",
+    lambda axis: (Number("jump", "joint", 0.02, (add("slip"),), 0.0),),
+    lambda axis: [{"slip_begin": begin, "slip_end": end} for begin, end in axis.jumps],
 )
 
 # A limit of the speed: the drive follows a command no faster.

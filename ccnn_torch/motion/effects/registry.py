@@ -14,14 +14,22 @@ from ccnn_torch.spelling import nearest
 EFFECTS: dict[str, MotionEffect] = {
     effect.name: effect
     for effect in (
-        *(control.DELAY, control.SERVO_GAIN, control.OFFSET, bodies.GRAVITY, bodies.PAYLOAD, bodies.INERTIA),
+        *(
+            control.DELAY,
+            control.SERVO_GAIN,
+            control.OFFSET,
+            control.JOINT_GAIN,
+            bodies.GRAVITY,
+            bodies.PAYLOAD,
+            bodies.INERTIA,
+        ),
         *(friction.VISCOUS, friction.COULOMB, friction.STRIBECK, gears.BACKLASH, gears.FLEXIBLE_JOINT),
         *(control.SPEED_LIMIT, control.SATURATION, control.SUPPLY, gears.COGGING, friction.THERMAL_FRICTION),
-        *(control.INTEGRAL_ACTION, control.DEAD_BAND, control.ACCELERATION_LIMIT),
+        *(control.INTEGRAL_ACTION, control.DEAD_BAND, control.ACCELERATION_LIMIT, control.LOST_STEPS),
     )
 }
 
-EXACT = frozenset({"delay", "servo_gain", "offset", "gravity", "payload", "inertia"})
+EXACT = frozenset({"delay", "servo_gain", "offset", "joint_gain", "gravity", "payload", "inertia", "lost_steps"})
 """Effects whose form is that of rigid bodies and of the control loop; friction, play and limits differ from theirs."""
 
 OWN = "own "
@@ -55,4 +63,5 @@ def motion_effects(names: Sequence[str] | None = None) -> list[MotionEffect]:
             near = nearest(name, list(EFFECTS))
             hint = f"; '{near}' is the nearest" if near else ""
             raise InputError(f"effects: there is no effect of motion '{name}'{hint}; known: {', '.join(EFFECTS)}")
-    return list(found.values())
+    # In the same order always, so that the order in which they are asked for decides no tie.
+    return sorted(found.values(), key=lambda effect: [*EFFECTS, effect.name].index(effect.name))
