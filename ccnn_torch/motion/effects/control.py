@@ -93,7 +93,7 @@ SATURATION = MotionEffect(
         Number("torque", "torque", 2 / axis.error, (add("weakness"),), inverse=True),
         Number("speed without torque", "speed", 0.3 / axis.speed, (add("fading"),), 0.0, inverse=True),
     ),
-    lambda axis: [{"torque": 1 / (share * axis.error)} for share in (0.3, 0.6, 0.9)],
+    lambda axis: [{"torque": 1 / (share * axis.error)} for share in (0.1, 0.3, 0.9)],
 )
 
 # The zero jumps at a time: a stepper that loses steps, a belt that slips; until the end of the run, or from then on.
