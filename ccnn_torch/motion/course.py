@@ -215,8 +215,6 @@ def courses(
         u = _late(times, command[b], axis.delay) if axis.delay != 0 else command[b].copy()
         u += parameters.offset
         pushed, volts, heat = push[b % len(push)], supply[b % len(supply)], warm[b % len(warm)]
-        step, has, begin = times[1:] - times[:-1], each_has(axis), start[b].copy()
-        slipped = parameters.slip * ((times >= parameters.slip_begin) & (times < parameters.slip_end))
-        begin[0] -= slipped[0]
-        found[j] = course(axis, has, step, u, begin, bent[b % len(bent)], pushed, volts, heat, parts[j]) + slipped
+        step, has = times[1:] - times[:-1], each_has(axis)
+        found[j] = course(axis, has, step, u, start[b], bent[b % len(bent)], pushed, volts, heat, parts[j])
     return found

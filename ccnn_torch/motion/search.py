@@ -298,9 +298,9 @@ class _Pool:
         promised = promises(self.problem, self.whitening, pairs, self.nuisance, variances)
         for (i, fit), found in zip(pairs, promised, strict=True):
             if not fit.members:
-                # Alone each is tried from wherever it may begin: what limits a motion is far from linear.
-                wanted[i] |= {(v.effect, k): started(self.library, fit.spec, v, i) for k, (_, v) in enumerate(found)}
-                continue
+                # Alone an effect is tried from wherever its numbers may begin: limits are far from linear.
+                more = [started(self.library, fit.spec, v, i) for _, v in found if not v.held]
+                wanted[i] |= {(*spec.members, k): spec for k, spec in enumerate(more)}
             scores: dict[int, tuple[float, Variant]] = {}
             for score, variant in found:
                 if variant.effect not in scores or _level(score) > _level(scores[variant.effect][0]):

@@ -96,13 +96,6 @@ SATURATION = MotionEffect(
     lambda axis: [{"torque": 1 / (share * axis.error)} for share in (0.1, 0.3, 0.9)],
 )
 
-# The zero jumps at a time: a stepper that loses steps, a belt that slips; until the end of the run, or from then on.
-LOST_STEPS = MotionEffect(
-    "lost_steps",
-    lambda axis: (Number("jump", "joint", 0.02, (add("slip"),), 0.0),),
-    lambda axis: [{"slip_begin": begin, "slip_end": end} for begin, end in axis.jumps],
-)
-
 # A limit of the speed: the drive follows a command no faster.
 SPEED_LIMIT = MotionEffect(
     "speed_limit",
