@@ -229,12 +229,6 @@ _WORDS = {
         "The largest acceleration of the set point that the drive makes of the commands.",
         "Profile acceleration, ramp or trajectory settings of {where}.",
     ),
-    "lost_steps": Words(
-        "a zero that jumps during a run",
-        "lost steps",
-        "By how much the zero jumps.",
-        "Lost steps of a stepper, a belt or coupling that slips at {where}, or an encoder that misses counts.",
-    ),
     "dead_band": Words(
         "a dead band of the position control",
         "dead band",

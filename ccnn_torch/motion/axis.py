@@ -9,7 +9,7 @@ where u is the command after delay, speed limit, gear ratio and offset, and I th
 torques are then angles (N m per N m/rad), the inertia is in s^2, the viscous friction in s; a part of that which the
 drive makes is within the limit, too. Within a dead band u - q counts as 0. With all of these 0 the position follows
 the command exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and weight hang on a
-spring that pulls at the motor. Where the zero slips, what encoders show is q and that.
+spring that pulls at the motor.
 """
 
 from __future__ import annotations
@@ -144,8 +144,6 @@ def simulate_axes(
         moved = delayed(drive.time[torch.from_numpy(row)], late, delay[None])[0]
         late = torch.where(delay[:, None] != 0, moved, late)
     u, step = late.numpy() * (1 + a.ratio[own, None]) + a.offset[own, None], np.diff(time)
-    here = (time[row] >= a.slip_begin[own, None]) & (time[row] < a.slip_end[own, None])
-    slipped = a.slip[own, None] * here
     found, axis = np.empty((len(run), s)), axis_of(a)
     for many in np.unique(parts):
         here = np.flatnonzero(parts == many)
@@ -154,9 +152,8 @@ def simulate_axes(
         one, begin, bend, resists, volts, heat = (
             v[run[here] % len(v)].T for v in (step, start, bent, push, supply, warm)
         )
-        begin[0] -= slipped[here, 0]
         found[here] = course(some, has_any, one, u[here].T.copy(), begin, bend, resists, volts, heat, int(many)).T
-    return torch.from_numpy(found + slipped).reshape(*runs.shape, s)
+    return torch.from_numpy(found).reshape(*runs.shape, s)
 
 
 def _start_of(drive: Drive) -> Array:

@@ -216,8 +216,6 @@ def courses(
         u *= 1 + parameters.ratio
         u += parameters.offset
         pushed, volts, heat = push[b % len(push)], supply[b % len(supply)], warm[b % len(warm)]
-        step, has, begin = times[1:] - times[:-1], each_has(axis), start[b].copy()
-        slipped = parameters.slip * ((times >= parameters.slip_begin) & (times < parameters.slip_end))
-        begin[0] -= slipped[0]
-        found[j] = course(axis, has, step, u, begin, bent[b % len(bent)], pushed, volts, heat, parts[j]) + slipped
+        step, has = times[1:] - times[:-1], each_has(axis)
+        found[j] = course(axis, has, step, u, start[b], bent[b % len(bent)], pushed, volts, heat, parts[j])
     return found

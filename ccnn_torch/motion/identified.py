@@ -83,9 +83,7 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     library, data = found.problem.library, found.problem.data
     values = library.parameters(torch.stack([v.best.spec.theta for v in found.verdicts]), found.problem.axes)
     own = {name.removeprefix(OWN): values.pop(name) for name in [*values] if name.startswith(OWN)}
-    # What happened once is no part of the machine.
-    for name in (CARRIED, "slip", "slip_begin", "slip_end"):
-        values.pop(name, None)
+    values.pop(CARRIED, None)
     count = len(found.verdicts)
     axes = [{name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]} for i in range(count)]
     content = _File(

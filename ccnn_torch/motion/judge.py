@@ -27,6 +27,7 @@ from ccnn_torch.motion.fit import evidences, products, side_by_side, squares_uns
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, log_posterior
 from ccnn_torch.motion.spec import Fit, Spec
+from ccnn_torch.motion.stretches import direction
 from ccnn_torch.motion.whiten import white_noise
 
 # Probability of something outside that takes nothing away on runs that no fit saw, and of nothing where a set leaves
@@ -40,8 +41,6 @@ _NEARLY = 1.02
 _KNOTS, _EVENLY = 7, 9
 # Time constants of what fades after a reversal [s].
 _FADING = (0.03, 0.1, 0.3)
-# Share of the mean speed at which a direction is settled.
-_SOFT = 0.1
 # Changes of the temperature below this show nothing [K].
 _WARMER = 5.0
 # Share of the motion from which the lead of the command over the position is a torque.
@@ -304,8 +303,8 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
     # An axis that follows exactly has no torque, and what rounding leaves of it has the sign of the speed.
     span = (data.position.amax((-1, -2)) - data.position.amin((-1, -2)))[:, None, None, None]
     loaded = error.abs().amax((-1, -2))[:, None, None, None] > _LOADED * span
-    place, over = _evenly(moved, data.judged), _over_time(problem)
-    sign = _direction(speed)[:, None]
+    place, over = _hats(moved, data.judged, True), _over_time(problem)
+    sign = direction(speed, speed.abs().mean((-1, -2), keepdim=True))[:, None]
     fast = _hats(speed, data.judged)
     direct = {
         "speed": fast,
@@ -329,46 +328,30 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
     return found + [Driver(n, c) for (n, _), c in zip(pushed, torch.split(columns, widths, 1), strict=True)]
 
 
-def _direction(speed: Tensor) -> Tensor:
-    """The sign of the speed, soft near standstill."""
-    size = speed.abs().mean((-1, -2), keepdim=True)
-    return torch.tanh(speed / (_SOFT * size).clamp_min(1e-12))
-
-
 def _slope(values: Tensor, step: Tensor) -> Tensor:
     slope = values.diff(dim=-1) / step
     return torch.cat([slope[..., :1], slope], -1)
 
 
-def _hats(driver: Tensor, judged: Tensor) -> Tensor:
-    """Piecewise linear functions with their knots at quantiles, `n x m x b x s`."""
-    found = []
-    for one in driver:
-        some = one[judged][:: max(int(judged.sum()) // 10_000, 1)]
-        knots = torch.unique(torch.quantile(some, torch.linspace(*_ENDS, _KNOTS, dtype=one.dtype)))
-        if len(knots) < 3:
-            found.append(torch.zeros(_KNOTS, *one.shape, dtype=one.dtype))
-            continue
-        place = (torch.searchsorted(knots, one.contiguous()) - 1).clamp(0, len(knots) - 2)
-        share = ((one - knots[place]) / (knots[place + 1] - knots[place])).clamp(0, 1)
-        hats = torch.zeros(_KNOTS, *one.shape, dtype=one.dtype)
-        hats.scatter_(0, place[None], (1 - share)[None])
-        hats.scatter_(0, place[None] + 1, share[None])
-        found.append(hats)
-    return torch.stack(found)
-
-
-def _evenly(driver: Tensor, judged: Tensor) -> Tensor:
-    """Piecewise linear functions with evenly spaced knots, `n x m x b x s`."""
-    low = torch.stack([one[judged].min() for one in driver])[:, None, None]
-    high = torch.stack([one[judged].max() for one in driver])[:, None, None]
-    return _tents((driver - low) / (high - low).clamp_min(1e-12))
-
-
-def _tents(share: Tensor) -> Tensor:
-    """Of a driver from 0 to 1, `n x b x s`."""
-    knots = torch.linspace(0, 1, _EVENLY, dtype=share.dtype)[:, None, None]
-    return (1 - (share[:, None] - knots).abs() * (_EVENLY - 1)).clamp_min(0)
+def _hats(driver: Tensor, judged: Tensor, is_even: bool = False) -> Tensor:
+    """Piecewise linear functions, `n x m x b x s`, with their knots at quantiles, or evenly spaced."""
+    share = (
+        torch.linspace(0, 1, _EVENLY, dtype=driver.dtype)
+        if is_even
+        else torch.linspace(*_ENDS, _KNOTS, dtype=driver.dtype)
+    )
+    found = driver.new_zeros(len(driver), len(share), *driver.shape[1:])
+    for hats, one in zip(found, driver, strict=True):
+        some = one[judged]
+        few = some[:: max(len(some) // 10_000, 1)]
+        even = some.min() + share * (some.max() - some.min())
+        knots = torch.unique(even if is_even else torch.quantile(few, share))
+        if len(knots) > 2:
+            place = (torch.searchsorted(knots, one.contiguous()) - 1).clamp(0, len(knots) - 2)
+            within = ((one - knots[place]) / (knots[place + 1] - knots[place])).clamp(0, 1)
+            hats.scatter_(0, place[None], (1 - within)[None])
+            hats.scatter_(0, place[None] + 1, within[None])
+    return found
 
 
 def _fading(speed: Tensor, time: Tensor) -> Tensor:
@@ -391,4 +374,4 @@ def _over_time(problem: Problem) -> Tensor:
         mine = data.run == run
         ends = data.time[mine][data.judged[mine]]
         share[mine] = ((data.time[mine] - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)).clamp(0, 1)
-    return _tents(share[None]).expand(len(problem.followed), -1, -1, -1)
+    return _hats(share[None], data.judged, True).expand(len(problem.followed), -1, -1, -1)

@@ -37,8 +37,6 @@ _REACH = 0.6
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
 _RARER = dict.fromkeys(("stribeck", "cogging", "dead_band", "acceleration_limit"), math.log(0.1))
-# Of a hundred times at which a zero may have moved those were taken that look most like it.
-_RARER["lost_steps"] = math.log(0.01)
 _SMALLEST = 1e-6
 # Shapes that a fit refines from where they begin.
 _REFINED = ("cogging_order", "stribeck_speed", "flexible_damping", "play_friction")

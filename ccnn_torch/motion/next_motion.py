@@ -166,7 +166,6 @@ def _problem_of(problem: Problem, axis: int, proposed: Sequence[Motion]) -> Prob
         run=torch.zeros(1, dtype=torch.int64),
         beside={},
         bent=None,
-        part=torch.zeros(1, dtype=torch.int64),
         begin=None,
     )
     step = float(problem.data.time.diff(dim=-1).median()) * problem.pool

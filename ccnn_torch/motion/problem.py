@@ -74,7 +74,7 @@ class Problem:
             self,
             data=data._replace(
                 **{n: some(getattr(data, n)) for n in ("command", "position", "speed", "begin")},
-                **{n: some(getattr(data, n), 0) for n in ("time", "judged", "run", "log", "bent", "part")},
+                **{n: some(getattr(data, n), 0) for n in ("time", "judged", "run", "log", "bent")},
                 beside={name: some(v, 0) for name, v in data.beside.items()},
             ),
             **{n: some(getattr(self, n)) for n in ("followed", "torque", "simulated", "there", "carried")},
@@ -91,14 +91,9 @@ class Problem:
             return torch.stack([q, v, faster], -1)
         start = torch.cat([torch.stack([q, v], -1), data.begin], -1)
         if self.torque is not None:
-            start[..., START.index("torque")] = self._usual(self.torque)
+            # That of the first stretch of each run.
+            start[..., START.index("torque")] = self.torque[:, torch.searchsorted(data.run, data.run), 0]
         return start
-
-    def _usual(self, values: Tensor) -> Tensor:
-        """Means over the stretches of the same log, `p x b x s` -> `p x b`."""
-        part, own = self.data.part, values.mean(-1)
-        found = own.new_zeros(len(own), int(part.max()) + 1)
-        return (found.index_add(1, part, own) / part.bincount())[:, part]
 
     def positions(self, theta: Tensor, axis: Tensor, chosen: Tensor | None = None) -> Tensor:
         """Simulated positions of models of axes.
@@ -136,32 +131,11 @@ class Problem:
             `n x m x b x s`.
         """
         n, m, b, s = torque.shape
-        already = 0.0 if self.torque is None else self.torque[:, None]
-        every = torque + already
-
-        def many(values: Tensor) -> Tensor:
-            return values.repeat(m, *[1] * (values.dim() - 1))
-
-        # A stretch for every torque.
-        data = self.data._replace(
-            time=many(self.data.time),
-            position=self.data.position.repeat(1, m, 1),
-            bent=None if self.data.bent is None else self.data.bent.repeat(m),
-            speed=self.data.speed.repeat(1, m, 1),
-            part=(self.data.part + (int(self.data.part.max()) + 1) * torch.arange(m)[:, None]).flatten(),
-            begin=None if self.data.begin is None else self.data.begin.repeat(1, m, 1),
-        )
-        wide = replace(
-            self,
-            data=data,
-            followed=self.followed.repeat(1, m, 1),
-            supply=many(self.supply),
-            warm=many(self.warm),
-            torque=every.reshape(n, m * b, s),
-            simulated=None,
-            own={name: v.repeat(1, m, 1) for name, v in self.own.items()},
-            carried=None if self.carried is None else self.carried.repeat(1, m, 1),
-        )
+        every = torque if self.torque is None else torque + self.torque[:, None]
+        # A stretch, and a run, for every torque.
+        wide = self.of(torch.arange(b).repeat(m))
+        run = wide.data.run + (int(wide.data.run.max()) + 1) * torch.arange(m).repeat_interleave(b)
+        wide = replace(wide, data=wide.data._replace(run=run), torque=every.reshape(n, m * b, s), simulated=None)
         moved = wide.positions(theta, self.axes).reshape(n, m, b, s)
         return moved if self.simulated is None else moved + self._beyond[:, None]
 
@@ -221,7 +195,9 @@ class Problem:
             at = {name: v[which.flatten() % len(v)] for name, v in drive._asdict().items() if v is not None}
             drive = drive._replace(**at | {"torque": torque.flatten(0, 1)})
             if drive.start.shape[1] == len(START):
-                drive.start[:, START.index("torque")] += load.mean(-1).flatten()
+                first = torch.searchsorted(self.data.run, self.data.run)[rows]
+                begun = mass[:, None] * self.carried[axis[:, None], first, 0]
+                drive.start[:, START.index("torque")] += begun.flatten()
             which = torch.arange(which.numel()).reshape(which.shape)
         moved = simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
         for name, value in own.items():

@@ -276,9 +276,9 @@ class _Pool:
             now = [min(own, key=lambda f: f.left).spec if own else s for s, own in zip(now, less, strict=True)]
 
     def fewer(self, sets: Sequence[Spec], steps: int) -> list[list[Fit]]:
-        """The set of each axis without each of its members, fitted where it was not before."""
+        """The set of each axis without each of its members, fitted anew: it may have been tried from farther away."""
         less = [[without(self.library, s, k) for k in range(len(s.members))] for s in sets]
-        self.fit([[s for s in own if s.members not in self.found[i]] for i, own in enumerate(less)], steps)
+        self.fit(less, steps)
         return [[self.found[i][s.members] for s in own] for i, own in enumerate(less)]
 
     def screened(
@@ -297,6 +297,10 @@ class _Pool:
         variances = [self.noise_of(i) for i, _ in pairs]
         promised = promises(self.problem, self.whitening, pairs, self.nuisance, variances)
         for (i, fit), found in zip(pairs, promised, strict=True):
+            if not fit.members:
+                # Alone an effect is tried from wherever its numbers may begin: limits are far from linear.
+                more = [started(self.library, fit.spec, v, i) for _, v in found if not v.held]
+                wanted[i] |= {(*spec.members, k): spec for k, spec in enumerate(more)}
             scores: dict[int, tuple[float, Variant]] = {}
             for score, variant in found:
                 if variant.effect not in scores or _level(score) > _level(scores[variant.effect][0]):

@@ -20,8 +20,7 @@ from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.nominal import Driven, Nominal, own_simulator
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.servo import servo
-from ccnn_torch.motion.stage import NEVER
-from ccnn_torch.motion.stretches import Stretches, cut_stretches
+from ccnn_torch.motion.stretches import Stretches, cut_stretches, direction
 from ccnn_torch.plugins import is_plugin
 
 # Seconds over which samples are averaged before they are judged.
@@ -30,8 +29,6 @@ _POOLED = 0.02
 _HIGHEST, _RIPPLES = 200.0, 4
 # Median sizes at which what is left of the torque is clipped.
 _CLIPPED = 3.0
-# Share of the mean speed at which a direction is settled.
-_SOFT = 0.1
 # Quantile of what counts as nearly the largest.
 _NEARLY = 0.98
 
@@ -60,10 +57,7 @@ def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEf
     unit = torch.exp2((1e-3 * span).clamp_min(1e-12).log2().round())
     pool = max(round(_POOLED / float(data.time.diff(dim=-1).median())), 1)
     own = driven._asdict()
-    problem = Problem(data, library, pool=pool, supply=supply, warm=warm, unit=unit, known=nominal.known, **own)
-    left = problem.residual(torch.zeros(len(facts), library.size, dtype=torch.float64), problem.axes)
-    facts = [replace(own, jumps=_jumps(data, left[i], i)) for i, own in enumerate(facts)]
-    return replace(problem, library=library_of(effects, facts))
+    return Problem(data, library, pool=pool, supply=supply, warm=warm, unit=unit, known=nominal.known, **own)
 
 
 def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Tensor, warm: Tensor) -> Facts:
@@ -92,32 +86,6 @@ def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Te
     )
 
 
-def _jumps(data: Stretches, residual: Tensor, i: int) -> tuple[tuple[float, float], ...]:
-    """Times from which and up to which the zero of a joint's position seems to be another one [s]: up to the end of the
-    run, or for ever.
-
-    residual: of the nominal model, `b x s`.
-    """
-    order = data.time[data.judged].argsort()
-    time, left, q, v = (x[data.judged][order] for x in (data.time, residual, data.position[i], data.speed[i]))
-    run = data.run[:, None].expand(data.judged.shape)[data.judged][order]
-    smooth = torch.stack([torch.ones_like(q), v, torch.sign(v), torch.sin(q), torch.cos(q)], -1)
-    base = torch.linalg.qr(smooth / smooth.square().mean(0).sqrt().clamp_min(1e-12)).Q
-    left = left - base @ (base.mT @ left)
-    # What a step from each sample on explains beside what is smooth.
-    sums = torch.cat([left[:, None], base, torch.ones_like(q)[:, None]], -1).flip(0).cumsum(0).flip(0)
-    ends = torch.searchsorted(run, run, right=True)
-    after = torch.cat([sums, torch.zeros_like(sums[:1])])[ends]
-    once, ever = (
-        int((s[:, 0].square() / (s[:, -1] - s[:, 1:-1].square().sum(-1)).clamp_min(1.0)).argmax())
-        for s in (sums - after, sums)
-    )
-    last = int(ends[once])
-    # Between the runs.
-    end = NEVER if last == len(run) else float(time[last - 1 : last + 1].mean())
-    return (float(time[once]), end), (float(time[ever]), NEVER)
-
-
 def _ripples(
     position: Tensor, command: Tensor, time: Tensor, judged: Tensor, nominal: Mapping[str, float]
 ) -> tuple[float, ...]:
@@ -138,11 +106,11 @@ def _ripples(
     torque = nominal.get("inertia", 0.0) * a + nominal.get("viscous", 0.0) * v - motor
     span = float(q.max() - q.min()) or 1.0
     x = (q - q.mean()) / span
-    # A command at rest has no direction, whatever its last digit is.
-    direction = torch.tanh(w / (_SOFT * w.abs().mean()).clamp_min(1e-12))
     # Of a model without inertia and friction command and position are all of the torque.
     gain = [u] if nominal.get("inertia") or nominal.get("viscous") else []
-    smooth = torch.stack([torch.ones_like(x), *(x**k for k in range(1, 6)), *gain, w, direction, f], -1)
+    smooth = torch.stack(
+        [torch.ones_like(x), *(x**k for k in range(1, 6)), *gain, w, direction(w, w.abs().mean()), f], -1
+    )
     scale = smooth.square().mean(0).sqrt().clamp_min(1e-300)
     smooth = smooth / scale
     left = torque - smooth @ torch.linalg.lstsq(smooth, torque[:, None], driver="gelsd").solution[:, 0]

@@ -20,8 +20,6 @@ from ccnn_torch.motion.compilable import compilable, pick
 Array = NDArray[np.float64]
 GAMMA = 1 - 1 / math.sqrt(2)
 TINY = 1e-9
-NEVER = 1e9
-"""s: later than any log ends."""
 # How steep a wave is followed: shares of what gain and friction, and inertia, resist a motion with within a stage.
 _STEEP, _SWINGING = 0.4, 0.05
 # Largest slope of exp(-x^2).
@@ -62,9 +60,6 @@ class Given(NamedTuple):
     delay: Any = 0.0
     offset: Any = 0.0
     ratio: Any = 0.0
-    slip: Any = 0.0
-    slip_begin: Any = 0.0
-    slip_end: Any = NEVER
     dead_band: Any = 0.0
     supply: Any = 0.0
     play: Any = 0.0

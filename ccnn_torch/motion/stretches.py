@@ -28,6 +28,8 @@ _SHORTEST = 0.4
 _STEP = 0.008
 # At most so many stretches are evaluated, spread evenly over the logs.
 _MOST = 48
+# Share of the mean speed at which a direction is settled.
+_SOFT = 0.1
 # Half the width of the window in which the speed is the slope of a parabola [s].
 _WINDOW = 0.03
 
@@ -39,7 +41,7 @@ class Stretches(NamedTuple):
     """`n` joints, `b` stretches, `s` samples, padded.
 
     Attributes:
-        time: `b x s` [s], increasing also in the padding, and from each log to the next.
+        time: `b x s` [s], increasing also in the padding.
         command, position: `n x b x s` [rad or m].
         speed: smoothed, `n x b x s`.
         judged: whether a sample counts, `b x s`.
@@ -49,7 +51,6 @@ class Stretches(NamedTuple):
         units: of the joints.
         notes: what was left out, one sentence each without a full stop.
         bent: as of `Drive`; None where no log was thinned.
-        part: which part of a log without gaps each is of, `b`.
         begin: `START` of each stretch but for its position and speed, the torque 0, `n x b x 17`; None where nothing
             is known beyond its samples.
     """
@@ -64,7 +65,6 @@ class Stretches(NamedTuple):
     log: Tensor
     units: tuple[str, ...]
     notes: tuple[str, ...]
-    part: Tensor
     begin: Tensor | None
     bent: Tensor | None = None
 
@@ -76,7 +76,6 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
         InputError: no part with the drive on is long enough.
     """
     pieces: list[tuple[int, NDArray[np.int64], int]] = []
-    parts: list[int] = []
     means: list[Array] = []
     notes = [note for log in logs for note in log.notes]
     strides = []
@@ -90,7 +89,6 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
             rows = part[::stride]
             found = _pieces(log.time[rows], rows) if log.on[part].all() else []
             pieces += [(number, *piece) for piece in found]
-            parts += [max(parts, default=-1) + 1] * len(found)
             means += [*_begins(log, part, [rows[0] - part[0] for rows, _ in found])] if found else []
     if not pieces:
         raise InputError(
@@ -102,13 +100,11 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
     if len(pieces) > _MOST:
         notes.append(f"{_MOST} of {count_text(len(pieces), 'stretch')}, spread evenly over the logs, were evaluated")
         kept = np.unique(np.linspace(0, len(pieces) - 1, _MOST).round().astype(int))
-        pieces, parts, means = ([some[i] for i in kept] for some in (pieces, parts, means))
+        pieces, means = [pieces[i] for i in kept], [means[i] for i in kept]
     # A command is a straight line between the samples of the log, not between those that are left.
     bent = torch.tensor([1 - strides[number] ** -2 for number, _, _ in pieces], dtype=torch.float64)
     begin = torch.from_numpy(np.stack(means, 1))
-    return _padded(logs, pieces, notes)._replace(
-        bent=bent if max(strides) > 1 else None, part=torch.tensor(parts), begin=begin
-    )
+    return _padded(logs, pieces, notes)._replace(bent=bent if max(strides) > 1 else None, begin=begin)
 
 
 def _begins(log: Log, part: NDArray[np.int64], stretches: Sequence[int]) -> Iterator[Array]:
@@ -148,6 +144,11 @@ def smooth_speed(time: Array, position: Array) -> Array:
     return slopes[:, 1:] / slopes[:, :1]
 
 
+def direction(speed: Tensor, usual: Tensor) -> Tensor:
+    """The sign of a speed, soft near standstill, of which a last digit then decides nothing; usual: mean size."""
+    return torch.tanh(speed / (_SOFT * usual).clamp_min(1e-12))
+
+
 def _slopes(values: Array, half: int) -> Array:
     """Slope for each sample, `s x n`, of the parabola through `half` neighbours on both sides; at the ends of the
     first and the last one."""
@@ -178,19 +179,14 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
     names = set.intersection(*(set(log.beside) for log in logs))
     time = np.zeros((len(pieces), length))
     command, position, speed = (np.zeros((n, len(pieces), length)) for _ in range(3))
-    # One run after the other, also where each has a clock of its own.
-    shifts, end = [], -np.inf
-    for log in logs:
-        shifts.append(0.0 if log.time[0] > end else end - log.time[0] + 1)
-        end = shifts[-1] + log.time[-1]
     judged = np.zeros((len(pieces), length), dtype=np.bool_)
     place = np.full((len(pieces), length), -1, dtype=np.int64)
     beside = {name: np.zeros((len(pieces), length)) for name in sorted(names)}
     for k, (number, rows, lead) in enumerate(pieces):
         log, m = logs[number], len(rows)
         step = float(np.median(np.diff(log.time[rows])))
-        time[k, :m], place[k, :m] = shifts[number] + log.time[rows], rows
-        time[k, m:] = time[k, m - 1] + step * np.arange(1, length - m + 1)
+        time[k, :m], place[k, :m] = log.time[rows], rows
+        time[k, m:] = log.time[rows[-1]] + step * np.arange(1, length - m + 1)
         judged[k, lead:m] = True
         slope = smooth_speed(log.time[rows], log.position[rows])
         for table, values in ((command, log.command[rows]), (position, log.position[rows]), (speed, slope)):
@@ -208,7 +204,6 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
         log=torch.from_numpy(place),
         units=logs[0].units,
         notes=tuple(notes),
-        part=torch.zeros(0, dtype=torch.int64),
         begin=None,
     )
 

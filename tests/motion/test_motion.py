@@ -239,21 +239,6 @@ def test_a_joint_that_moves_another_share_of_its_command_is_no_weight(tmp_path: 
     assert found["effects"][0]["parameters"]["q1 gain"]["value"] == pytest.approx(-0.03, rel=0.03)
 
 
-def test_a_zero_that_jumps_in_one_run_is_named_with_its_time(tmp_path: Path) -> None:
-    log, at = write_log(tmp_path / "log.csv", (0, 1), 2.4), 1.3
-    head, *rows = log.read_text().splitlines()
-    cells = [row.split(",") for row in rows]
-    lines = [f"{t},{r},{u},{float(q) + 0.05 * (r == '0' and float(t) > at)!r}" for t, r, u, q in cells]
-    log.write_text("\n".join([head, *lines]) + "\n")
-    tried = ["lost_steps", "offset", "coulomb"]
-    found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), tried).content
-    assert found["verdict"]["effects"] == ["lost_steps"] and found["verdict"]["probability"] > 0.9
-    values = {n: v["value"] for n, v in found["effects"][0]["parameters"].items()}
-    assert values["q1 jump"] == pytest.approx(0.05, rel=0.02)
-    # Up to the end of the run, and no more.
-    assert values["q1 slip_begin"] == pytest.approx(at, abs=0.03) and 2.3 < values["q1 slip_end"] < 3.8
-
-
 def test_a_limit_that_falls_with_the_speed_is_told_with_the_speed_at_which_it_is_none(tmp_path: Path) -> None:
     def limited(time: np.ndarray, asked: np.ndarray) -> np.ndarray:
         # A direct-current motor without torque at 2.5 rad/s, in 40 steps for each sample.

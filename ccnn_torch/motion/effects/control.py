@@ -96,14 +96,7 @@ SATURATION = MotionEffect(
         Number("torque", "torque", 2 / axis.error, (add("weakness"),), inverse=True),
         Number("speed without torque", "speed", 0.3 / axis.speed, (add("fading"),), 0.0, inverse=True),
     ),
-    lambda axis: [{"torque": 1 / (share * axis.error)} for share in (0.3, 0.6, 0.9)],
-)
-
-# The zero jumps at a time: a stepper that loses steps, a belt that slips; until the end of the run, or from then on.
-LOST_STEPS = MotionEffect(
-    "lost_steps",
-    lambda axis: (Number("jump", "joint", 0.02, (add("slip"),), 0.0),),
-    lambda axis: [{"slip_begin": begin, "slip_end": end} for begin, end in axis.jumps],
+    lambda axis: [{"torque": 1 / (share * axis.error)} for share in (0.1, 0.3, 0.9)],
 )
 
 # A limit of the speed: the drive follows a command no faster.

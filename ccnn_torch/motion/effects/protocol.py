@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from ccnn_torch.motion.stage import NEVER
-
 
 @dataclass(frozen=True)
 class Facts:
@@ -27,7 +25,6 @@ class Facts:
         error: nearly the largest difference of command and position [rad or m].
         supply, temperature: largest relative change of the supply voltage, and of the temperature [K], in the logs.
         ripples: periods in a turn (in 2 pi m) that a torque seems to repeat with.
-        jumps: times from which and up to which the zero of the position seems to be another one [s]; two of them.
     """
 
     unit: str
@@ -42,7 +39,6 @@ class Facts:
     supply: float = 0.0
     temperature: float = 0.0
     ripples: tuple[float, ...] = ()
-    jumps: tuple[tuple[float, float], ...] = ((0.0, NEVER),) * 2
 
     @property
     def driven(self) -> bool:

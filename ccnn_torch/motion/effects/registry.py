@@ -14,22 +14,15 @@ from ccnn_torch.spelling import nearest
 EFFECTS: dict[str, MotionEffect] = {
     effect.name: effect
     for effect in (
-        *(
-            control.DELAY,
-            control.SERVO_GAIN,
-            control.OFFSET,
-            control.JOINT_GAIN,
-            bodies.GRAVITY,
-            bodies.PAYLOAD,
-            bodies.INERTIA,
-        ),
+        *(control.DELAY, control.SERVO_GAIN, control.OFFSET, control.JOINT_GAIN),
+        *(bodies.GRAVITY, bodies.PAYLOAD, bodies.INERTIA),
         *(friction.VISCOUS, friction.COULOMB, friction.STRIBECK, gears.BACKLASH, gears.FLEXIBLE_JOINT),
         *(control.SPEED_LIMIT, control.SATURATION, control.SUPPLY, gears.COGGING, friction.THERMAL_FRICTION),
-        *(control.INTEGRAL_ACTION, control.DEAD_BAND, control.ACCELERATION_LIMIT, control.LOST_STEPS),
+        *(control.INTEGRAL_ACTION, control.DEAD_BAND, control.ACCELERATION_LIMIT),
     )
 }
 
-EXACT = frozenset({"delay", "servo_gain", "offset", "joint_gain", "gravity", "payload", "inertia", "lost_steps"})
+EXACT = frozenset({"delay", "servo_gain", "offset", "joint_gain", "gravity", "payload", "inertia"})
 """Effects whose form is that of rigid bodies and of the control loop; friction, play and limits differ from theirs."""
 
 OWN = "own "
