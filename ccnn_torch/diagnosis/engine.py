@@ -37,6 +37,7 @@ from ccnn_torch.effects import (
 )
 from ccnn_torch.effects.time import Homing
 from ccnn_torch.errors import InputError, RowsError
+from ccnn_torch.evidence.judge import BESIDE_UNKNOWN
 
 OUTLIER = "outlier"
 # More rows, and more measured values, than this name a cause no better: so many are drawn.
@@ -262,7 +263,8 @@ def _notes(
         )
     if judgement.outside and not proposed:
         notes.append("no measurement is proposed: no model predicts the measurements of a cause outside the library")
-    if not judgement.names and not judgement.outside and analysis.whitening.known == 0 and missing:
+    doubtful = not judgement.outside or judgement.probability <= BESIDE_UNKNOWN
+    if not judgement.names and doubtful and analysis.whitening.known == 0 and missing:
         columns = ", ".join(column for entry in missing for column in entry["columns"])
         notes.append(
             "the noise was not given, so that a cause that follows nothing recorded counts as noise: compare the noise "
