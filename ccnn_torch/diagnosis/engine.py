@@ -35,7 +35,7 @@ from ccnn_torch.effects import (
     owned,
     pose_residual,
 )
-from ccnn_torch.effects.time import Homing
+from ccnn_torch.effects.time import ROW, Homing
 from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.evidence.judge import BESIDE_UNKNOWN
 
@@ -132,12 +132,16 @@ def diagnose_rows(
     said = _judged(situation, measured, noise, effects, seed, instrument)
     for name, kind in of_order(situation).items():
         columns = kind.columns(situation, measured_order(situation))
-        if not order_shows(said.analysis, said.judgement, {n: v[said.chosen] for n, v in columns.items()}, kind):
+        # A term that follows the order of the rows leaves nothing to show.
+        told = name == ROW and any(d.startswith("time") for d in said.judgement.drivers)
+        if not told and not order_shows(
+            said.analysis, said.judgement, {n: v[said.chosen] for n, v in columns.items()}, kind
+        ):
             continue
         more = replace(situation, covariates={**situation.covariates, **columns})
         other = _judged(more, measured, noise, effects, seed, instrument, (*said.inferred, *columns))
         # Names that could not be asked for before, or a driver that was not there.
-        if {*said.lacking, kind.effect.name} & {*other.judgement.names} or any(
+        if {*said.lacking, *(e.name for e in kind.effects)} & {*other.judgement.names} or any(
             d.startswith(name) for d in other.judgement.drivers
         ):
             said, situation = other, more
