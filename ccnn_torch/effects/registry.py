@@ -225,8 +225,7 @@ def missing_on(effect: Effect, situation: Situation) -> str:
     if isinstance(effect, OwnEffect):
         for breach in _breaches(effect, situation):
             raise InputError(f"{effect.label}: {breach}")
-    lacking = effect.missing(situation.mechanism, [*situation.covariates])
-    return effect.with_pauses(situation) if isinstance(effect, Homing) and not lacking else lacking
+    return effect.missing(situation.mechanism, [*situation.covariates])
 
 
 def check_names(effects: Sequence[Effect]) -> None:

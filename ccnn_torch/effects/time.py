@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.columns import TWIST, by_joint, of_rows, one_by_one, shown_columns
+from ccnn_torch.effects.columns import TWIST, OfJoints, by_joint, of_rows, shown_columns
 from ccnn_torch.effects.constant import frame_columns
 from ccnn_torch.effects.joints import JointOffset
 from ccnn_torch.effects.loads import Member, members
@@ -269,7 +269,7 @@ _RATES = 8
 _SHARES = (0.003, 1.0)
 
 
-class Drift(Effect):
+class Drift(OfJoints):
     """Δq_i = a_i t + b_i ln(1 + t / r) + a random walk; t since the first row.
 
     r is how long it takes for the drift to slow down. The random walk (secondary) is the Karhunen-Loève expansion of
@@ -277,7 +277,6 @@ class Drift(Effect):
     """
 
     name = "drift"
-    kind = "joints"
     description = "drift of the joints in time: linear, logarithmic, or random"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
@@ -304,18 +303,8 @@ class Drift(Effect):
         step = (high - low) / (_RATES - 1)
         return (Shape("slowing", "s", tuple(math.exp(low + step * k) for k in range(_RATES)), _slowing(situation)),)
 
-    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x 6n`."""
-        return by_joint(self._moves(situation, shape))
-
-    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
-        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
-
-        rows: which, `t`; None = all. Returns `... x t x m`.
-        """
-        return one_by_one(of_rows(self._moves(situation, shape), rows, -3))
-
-    def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
+    def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same course for each joint."""
         time = elapsed(situation.covariates["time"]).expand(situation.joints.shape[:-1])
         whole = _duration(situation)
         share = time / whole
@@ -324,7 +313,7 @@ class Drift(Effect):
         turns = [(k + 0.5) * math.pi for k in range(_WALK)]
         parts += [math.sqrt(2) * torch.sin(turn * share) / turn for turn in turns]
         same = torch.stack(torch.broadcast_tensors(*parts), -1)  # type: ignore[no-untyped-call]
-        return same.unsqueeze(-2).expand(*same.shape[:-1], situation.joints.shape[-1], -1)
+        return of_rows(same.unsqueeze(-2).expand(*same.shape[:-1], situation.joints.shape[-1], -1), rows, -3)
 
 
 def _duration(situation: Situation) -> float:
@@ -345,8 +334,8 @@ _ZERO_BEGINS = 40
 class Homing(Effect):
     """Δq_i = c_is in session s: homed, or an encoder's zero found, anew after each pause between the rows.
 
-    Without pauses Δq_i = c_i from the time t₀ on, a shape: a belt skipped a tooth, an encoder lost counts. The zero
-    before that is `joint_offset`.
+    Without pauses, or with too many, Δq_i = c_i from the time t₀ on, a shape: a belt skipped a tooth, an encoder lost
+    counts. The zero before that is `joint_offset`.
     """
 
     name = "homing"
@@ -362,15 +351,8 @@ class Homing(Effect):
         return Homing(self._begins(situation))
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """Time; whether that has too many pauses, `with_pauses` tells."""
+        """Time, or the order of the rows."""
         return "" if "time" in covariates or ROW in covariates else "the time of each row: time[s]"
-
-    def with_pauses(self, situation: Situation) -> str:
-        """What is wrong with the times themselves, as in `missing`."""
-        most = situation.joints.shape[-2] // _SESSION_ROWS
-        if len(self._begins(situation)) <= most:
-            return ""
-        return f"{most} pauses in time[s] at most, each of five minutes and 20 usual steps or longer"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """One a joint and session; without pauses one a joint."""
@@ -405,7 +387,8 @@ class Homing(Effect):
         steps = time.diff()
         usual = float(steps.median()) if len(steps) else 0.0
         begins: Tensor = time[1:][steps > max(_USUAL_STEPS * usual, _PAUSE)]
-        return begins
+        most = situation.joints.shape[-2] // _SESSION_ROWS
+        return begins if len(begins) <= most else begins[:0]
 
 
 ROW = "row"

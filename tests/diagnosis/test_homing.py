@@ -64,13 +64,13 @@ def test_pauses_alone_are_no_new_zeros(wrong: str) -> None:
         assert said["effects"] == ([wrong] if wrong else []), (seed, said)
 
 
-def test_it_needs_pauses_and_few_of_them() -> None:
+def test_it_needs_times_and_has_sessions_where_pauses_are_few() -> None:
     homing = make_effect("homing")
     assert "time[s]" in homing.missing(ARM, [])
-    assert not missing_on(homing, measured(0, "")[0])
-    often, _ = measured(0, "", 20)
-    assert not missing_on(homing, measured(0, "", 1)[0]) and len(homing.shapes(measured(0, "", 1)[0])) == 1
-    assert "13 pauses in time[s] at most" in missing_on(homing, often) or len(homing.coefficients(often)) <= 26
+    # Without pauses, and with one at every other row, there is one new zero, of an unknown time.
+    for days, zeros in ((1, 2), (4, 8), (40, 2)):
+        rows, _ = measured(0, "", days)
+        assert not missing_on(homing, rows) and len(homing.coefficients(rows)) == zeros
 
 
 @pytest.mark.parametrize("timed", [True, False])
