@@ -35,8 +35,9 @@ from ccnn_torch.effects import (
     owned,
     pose_residual,
 )
-from ccnn_torch.effects.time import Homing
+from ccnn_torch.effects.time import ROW, Homing
 from ccnn_torch.errors import InputError, RowsError
+from ccnn_torch.evidence.judge import BESIDE_UNKNOWN
 
 OUTLIER = "outlier"
 # More rows, and more measured values, than this name a cause no better: so many are drawn.
@@ -131,12 +132,16 @@ def diagnose_rows(
     said = _judged(situation, measured, noise, effects, seed, instrument)
     for name, kind in of_order(situation).items():
         columns = kind.columns(situation, measured_order(situation))
-        if not order_shows(said.analysis, said.judgement, {n: v[said.chosen] for n, v in columns.items()}, kind):
+        # A term that follows the order of the rows leaves nothing to show.
+        told = name == ROW and any(d.startswith("time") for d in said.judgement.drivers)
+        if not told and not order_shows(
+            said.analysis, said.judgement, {n: v[said.chosen] for n, v in columns.items()}, kind
+        ):
             continue
         more = replace(situation, covariates={**situation.covariates, **columns})
         other = _judged(more, measured, noise, effects, seed, instrument, (*said.inferred, *columns))
         # Names that could not be asked for before, or a driver that was not there.
-        if {*said.lacking, kind.effect.name} & {*other.judgement.names} or any(
+        if {*said.lacking, *(e.name for e in kind.effects)} & {*other.judgement.names} or any(
             d.startswith(name) for d in other.judgement.drivers
         ):
             said, situation = other, more
@@ -262,7 +267,8 @@ def _notes(
         )
     if judgement.outside and not proposed:
         notes.append("no measurement is proposed: no model predicts the measurements of a cause outside the library")
-    if not judgement.names and not judgement.outside and analysis.whitening.known == 0 and missing:
+    doubtful = not judgement.outside or judgement.probability <= BESIDE_UNKNOWN
+    if not judgement.names and doubtful and analysis.whitening.known == 0 and missing:
         columns = ", ".join(column for entry in missing for column in entry["columns"])
         notes.append(
             "the noise was not given, so that a cause that follows nothing recorded counts as noise: compare the noise "

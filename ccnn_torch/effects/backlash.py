@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import per_force
-from ccnn_torch.effects.columns import by_joint, inside, of_rows, one_by_one
-from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
+from ccnn_torch.effects.columns import OfJoints, inside, of_rows
+from ccnn_torch.effects.protocol import Coefficient, Shape
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.mechanisms.frames.set_ups import GIVE
@@ -24,7 +24,7 @@ _SOFT = 0.3
 _EDGES = ((" softer", 2 * _SOFT), (" harder", 0.5 * _SOFT))
 
 
-class Backlash(Effect):
+class Backlash(OfJoints):
     """Δq_i = b_i / 2 tanh((w_i / h - s_i) / e) / tanh(1 / e): s the direction of approach, w the push on the joint.
 
     Without any direction s is 0, and h so small that a load throws the joint from one flank to the other, as it does
@@ -37,7 +37,6 @@ class Backlash(Effect):
     """
 
     name = "backlash"
-    kind = "joints"
     description = "backlash of the drives: the rest position depends on the direction of approach, or on the load"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
@@ -58,7 +57,7 @@ class Backlash(Effect):
                 mends=mends,
                 positive=not mends,
             )
-            for j in (situation.mechanism.joints[i] for i in _on_either_flank(situation))
+            for j in (situation.mechanism.joints[i] for i in self.moving(situation))
             for part, size, mends in parts
         )
 
@@ -71,18 +70,12 @@ class Backlash(Effect):
         balanced = (0.0, *WEIGHTS)
         return (Shape("weight", "N", balanced, usual=PLATFORM_WEIGHT), hold) if situation.loaded else (hold,)
 
-    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x 3 · (joints whose direction is known, or all)`."""
-        return by_joint(self._moves(situation, shape), _on_either_flank(situation))
+    def moving(self, situation: Situation) -> list[int]:
+        """Joints whose direction is known; all, where that is of none."""
+        return situation.directed or super().moving(situation)
 
-    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
-        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
-
-        rows: which, `t`; None = all. Returns `... x t x m`.
-        """
-        return one_by_one(self._moves(situation, shape, rows), _on_either_flank(situation))
-
-    def _moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+    def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Where each joint rests, and what other edges change of that."""
         weight = shape[..., 0] if situation.loaded else shape.new_tensor(PLATFORM_WEIGHT)
         hold = shape[..., -1, None, None]
         # A joint that friction does not hold at all changes its flank as softly as one that it hardly holds.
@@ -100,11 +93,6 @@ def _without_direction(mechanism: Mechanism, covariates: Sequence[str]) -> str:
     return "" if there else f"the sign of each joint's last motion before it stopped: direction1[1]…direction{n}[1]"
 
 
-def _on_either_flank(situation: Situation) -> list[int]:
-    """Numbers, from 0, of the joints that have columns: those whose direction is known; all, where that is of none."""
-    return situation.directed or [*range(situation.joints.shape[-1])]
-
-
 def _rest(left: Tensor, soft: float) -> Tensor:
     """Where a joint rests within its backlash, ±1/2 where nothing pushes it off its flank."""
     return torch.tanh(left / soft) / (2 * math.tanh(1 / soft))
@@ -116,7 +104,7 @@ _SHARE = 0.3
 _CONSTANT = {"m": 6e-6, "rad": 1e-5}
 
 
-class Friction(Effect):
+class Friction(OfJoints):
     """Δq_i = -s_i (c_i |τ_load,i| + d_i |τ_weight,i| + e_i): s the direction of approach, τ what the joint carries.
 
     Coulomb's friction is in proportion to what presses the surfaces together; a drive of compliance C and friction
@@ -126,7 +114,6 @@ class Friction(Effect):
     """
 
     name = "friction"
-    kind = "joints"
     description = "friction that winds up the drives against their last motion, growing with their load"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
@@ -160,21 +147,15 @@ class Friction(Effect):
         together = tuple(k for k, c in enumerate(self.coefficients(situation)) if c.name.endswith("together"))
         return (Shape("weight", "N", WEIGHTS, together, usual=PLATFORM_WEIGHT),)
 
-    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x m`, joint by joint."""
-        return by_joint(self._moves(situation, shape), situation.directed)
+    def moving(self, situation: Situation) -> list[int]:
+        """Joints whose direction is known."""
+        return situation.directed
 
-    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
-        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
-
-        rows: which, `t`; None = all. Returns `... x t x m`.
-        """
-        return one_by_one(of_rows(self._moves(situation, shape), rows, -3), situation.directed)
-
-    def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
+    def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """By what each joint carries."""
         load, weight = situation.load_torque, situation.own_weight_torque
         carried = [(weight * PLATFORM_WEIGHT).abs(), torch.ones_like(weight)]
         if situation.loaded:
             carried[:1] = [load.abs(), carried[0], (load + weight * shape[..., 0, None, None]).abs()]
         columns = torch.stack(torch.broadcast_tensors(*carried), -1)  # type: ignore[no-untyped-call]
-        return -situation.direction.unsqueeze(-1) * columns
+        return of_rows(-situation.direction.unsqueeze(-1) * columns, rows, -3)

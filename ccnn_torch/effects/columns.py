@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from ccnn_torch.effects.protocol import Effect
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, Seen, SerialArm
 from ccnn_torch.numerics.rotations import skew
@@ -35,15 +36,34 @@ def by_joint(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
     return blocks.reshape(*values.shape[:-1], blocks.shape[-2] * m)
 
 
-def one_by_one(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
-    """`by_joint` without its zeros: of each column the change of the one joint that it moves, `... x s x m`."""
-    chosen = values if joints is None else values[..., list(joints), :]
-    return chosen.flatten(-2)
-
-
 def of_rows(values: Tensor, rows: Tensor | None, dim: int = -2) -> Tensor:
     """Some of the rows, which count along `dim`; all where rows is None."""
     return values if rows is None else values.index_select(dim, rows)
+
+
+class OfJoints(Effect):
+    """An effect each of whose coefficients moves one joint: those of the first joint come first."""
+
+    kind = "joints"
+
+    def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Change of each joint per unit of its own coefficients, `... x t x n x m`; rows: which, `t`; None = all."""
+        raise NotImplementedError
+
+    def moving(self, situation: Situation) -> list[int]:
+        """Numbers, from 0, of the joints that have coefficients."""
+        return [*range(situation.joints.shape[-1])]
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x (joints that have coefficients · m)`."""
+        return by_joint(self.moves(situation, shape), self.moving(situation))
+
+    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
+
+        rows: which, `t`; None = all. Returns `... x t x (joints that have coefficients · m)`.
+        """
+        return self.moves(situation, shape, rows)[..., self.moving(situation), :].flatten(-2)
 
 
 def inside(mechanism: Mechanism) -> Mechanism:

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import force_of, torque_of
 from ccnn_torch.effects.columns import inside
-from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
-from ccnn_torch.effects.time import REFERENCE, ROW
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation
+from ccnn_torch.effects.time import ROW
 from ccnn_torch.mechanisms import Mechanism
 
 SHIFT = 8 * 3600.0

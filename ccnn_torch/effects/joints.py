@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter, plausible_error
-from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
+from ccnn_torch.effects.columns import OfJoints, by_joint, of_rows
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
@@ -132,14 +132,13 @@ _PERIODS = (1.5, 40.0)
 _PERIOD_STEP = 1 / 3
 
 
-class Transmission(Effect):
+class Transmission(OfJoints):
     """Δq_i = a_i sin(f_i q_i) + b_i cos(f_i q_i) and their harmonics up to the fourth; f_i unknown.
 
     The second may be as large as the first (a gear's two teeth in mesh), the third and the fourth are small.
     """
 
     name = "transmission"
-    kind = "joints"
     description = "a periodic error of a drive, of unknown period, as of a gear, a screw or an encoder"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
@@ -165,19 +164,9 @@ class Transmission(Effect):
             for i, j in enumerate(situation.mechanism.joints)
         )
 
-    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x 8n`."""
-        return by_joint(self._moves(situation.joints, shape))
-
-    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
-        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
-
-        rows: which, `t`; None = all. Returns `... x t x m`.
-        """
-        return one_by_one(self._moves(of_rows(situation.joints, rows), shape))
-
-    def _moves(self, joints: Tensor, shape: Tensor) -> Tensor:
-        angle = joints * shape.unsqueeze(-2)
+    def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Waves of each joint."""
+        angle = of_rows(situation.joints, rows) * shape.unsqueeze(-2)
         sine, cosine = torch.sin(angle), torch.cos(angle)
         waves = [sine, cosine]
         # The next harmonic by the sum of angles: sines are what a grid of hundreds of frequencies takes its time for.

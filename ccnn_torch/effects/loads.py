@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import force_of, per_force, torque_of
 from ccnn_torch.effects.columns import by_joint, inside, own_parameters
 from ccnn_torch.effects.protocol import Coefficient, Effect
-from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm, sees_directions
 from ccnn_torch.mechanisms.frames.set_ups import GIVE
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
@@ -120,6 +120,44 @@ class Compliance(Effect):
         parts = [jacobian * (torque * ratio**k).unsqueeze(-2) for k in range(3)]
         arm = isinstance(situation.mechanism, SerialArm)
         return torch.cat([*parts, *_of_an_arm(situation)] if arm else [*parts, _stretching(situation)], -1)
+
+
+# Change of a stiffness per kelvin: of steel 0.0003, of polymers, belts and grease some hundredths.
+_SOFTER = 0.02
+
+
+class ThermalCompliance(Effect):
+    """Δq_i = (T - 20 °C) (c_i τ_load,i + d_i τ_weight,i): a joint's compliance changes with the temperature T.
+
+    What it is at 20 °C is `compliance`, of the machine's own weight `gravity`; τ as there.
+    """
+
+    name = "thermal_compliance"
+    kind = "joints"
+    description = "joints whose stiffness changes with the temperature"
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """The temperature, and positions."""
+        if sees_directions(mechanism):
+            return "positions: what bends turns a direction as flexure does"
+        return "" if "temperature" in covariates else "the temperature of the surroundings: temperature[degC]"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """By load (where one was recorded) and by weight, joint by joint."""
+        found = []
+        for joint in situation.mechanism.joints:
+            size = GIVE[joint.unit] * _SOFTER
+            weight = "rad/m/K" if joint.unit == "rad" else "m/K"
+            if situation.loaded:
+                found.append(Coefficient(f"{joint.name} load", f"{per_force(joint.unit)}/K", size, joint=joint.name))
+            found.append(Coefficient(f"{joint.name} weight", weight, size * PLATFORM_WEIGHT, joint=joint.name))
+        return tuple(found)
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x m`."""
+        torques = [situation.load_torque] if situation.loaded else []
+        warm = situation.covariates["temperature"][..., None, None] - REFERENCE
+        return by_joint(torch.stack([*torques, situation.own_weight_torque], -1) * warm)
 
 
 class Sag(Effect):

@@ -17,7 +17,7 @@ from torch import Tensor
 from ccnn_torch.effects.backlash import Backlash, Friction
 from ccnn_torch.effects.constant import Flexure, Frame, Geometry, Instrument, Tool, parameter_causes
 from ccnn_torch.effects.joints import Coupling, JointGain, JointOffset, Transmission
-from ccnn_torch.effects.loads import Compliance, Gravity, Sag
+from ccnn_torch.effects.loads import Compliance, Gravity, Sag, ThermalCompliance
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.effects.time import Drift, FrameDrift, Homing, Latency, Thermal
@@ -225,8 +225,7 @@ def missing_on(effect: Effect, situation: Situation) -> str:
     if isinstance(effect, OwnEffect):
         for breach in _breaches(effect, situation):
             raise InputError(f"{effect.label}: {breach}")
-    lacking = effect.missing(situation.mechanism, [*situation.covariates])
-    return effect.without_pauses(situation) if isinstance(effect, Homing) and not lacking else lacking
+    return effect.missing(situation.mechanism, [*situation.covariates])
 
 
 def check_names(effects: Sequence[Effect]) -> None:
@@ -339,6 +338,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "backlash": Backlash,
     "friction": Friction,
     "compliance": Compliance,
+    "thermal_compliance": ThermalCompliance,
     "sag": Sag,
     "gravity": Gravity,
     "thermal": Thermal,

@@ -14,6 +14,8 @@ from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
 
+REFERENCE = 293.15
+"""Temperature at which a machine has its dimensions, ISO 1 [K]."""
 PLATFORM_WEIGHT = 100.0
 """Weight of a platform of which nothing is known [N]."""
 WEIGHTS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)

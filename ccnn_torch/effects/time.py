@@ -9,12 +9,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects.columns import TWIST, by_joint, of_rows, one_by_one, shown_columns
+from ccnn_torch.effects.columns import TWIST, OfJoints, by_joint, of_rows, shown_columns
 from ccnn_torch.effects.constant import frame_columns
 from ccnn_torch.effects.joints import JointOffset
 from ccnn_torch.effects.loads import Member, members
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
-from ccnn_torch.effects.situation import Situation
+from ccnn_torch.effects.situation import REFERENCE, Situation
 from ccnn_torch.mechanisms import Mechanism
 
 # Rows farther apart are not one trajectory [s].
@@ -132,8 +132,6 @@ def _velocity(situation: Situation) -> Tensor:
     return velocity(time, situation.joints)
 
 
-REFERENCE = 293.15
-"""Temperature at which a machine has its dimensions, ISO 1 [K]."""
 _STEEL = 1.2e-5
 # Of a member against the whole machine, and kelvins by which the reference may be off.
 _UNEVEN, _REFERENCE_OFF = 0.5, 5.0
@@ -271,7 +269,7 @@ _RATES = 8
 _SHARES = (0.003, 1.0)
 
 
-class Drift(Effect):
+class Drift(OfJoints):
     """Δq_i = a_i t + b_i ln(1 + t / r) + a random walk; t since the first row.
 
     r is how long it takes for the drift to slow down. The random walk (secondary) is the Karhunen-Loève expansion of
@@ -279,7 +277,6 @@ class Drift(Effect):
     """
 
     name = "drift"
-    kind = "joints"
     description = "drift of the joints in time: linear, logarithmic, or random"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
@@ -306,18 +303,8 @@ class Drift(Effect):
         step = (high - low) / (_RATES - 1)
         return (Shape("slowing", "s", tuple(math.exp(low + step * k) for k in range(_RATES)), _slowing(situation)),)
 
-    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x 6n`."""
-        return by_joint(self._moves(situation, shape))
-
-    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
-        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
-
-        rows: which, `t`; None = all. Returns `... x t x m`.
-        """
-        return one_by_one(of_rows(self._moves(situation, shape), rows, -3))
-
-    def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
+    def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same course for each joint."""
         time = elapsed(situation.covariates["time"]).expand(situation.joints.shape[:-1])
         whole = _duration(situation)
         share = time / whole
@@ -326,7 +313,7 @@ class Drift(Effect):
         turns = [(k + 0.5) * math.pi for k in range(_WALK)]
         parts += [math.sqrt(2) * torch.sin(turn * share) / turn for turn in turns]
         same = torch.stack(torch.broadcast_tensors(*parts), -1)  # type: ignore[no-untyped-call]
-        return same.unsqueeze(-2).expand(*same.shape[:-1], situation.joints.shape[-1], -1)
+        return of_rows(same.unsqueeze(-2).expand(*same.shape[:-1], situation.joints.shape[-1], -1), rows, -3)
 
 
 def _duration(situation: Situation) -> float:
@@ -340,14 +327,20 @@ def _slowing(situation: Situation) -> tuple[int, ...]:
 
 # A pause is so many times as long as the usual step, and no shorter [s]; a session has so many rows or more.
 _USUAL_STEPS, _PAUSE, _SESSION_ROWS = 20, 300.0, 6
+# Parts of the time at whose ends a zero may change where there is no pause.
+_ZERO_BEGINS = 40
 
 
 class Homing(Effect):
-    """Δq_i = c_is in session s: homed, or an encoder's zero found, anew after each pause between the rows."""
+    """Δq_i = c_is in session s: homed, or an encoder's zero found, anew after each pause between the rows.
+
+    Without pauses, or with too many, Δq_i = c_i from the time t₀ on, a shape: a belt skipped a tooth, an encoder lost
+    counts. The zero before that is `joint_offset`.
+    """
 
     name = "homing"
     kind = "joints"
-    description = "zeros of the joints that are found anew after each pause, as by homing"
+    description = "zeros of the joints that are found anew after each pause, as by homing, or are others from a row on"
 
     def __init__(self, begins: Tensor | None = None) -> None:
         """begins: of each session but the first, since the first row [s]; None = those of the rows given."""
@@ -358,38 +351,44 @@ class Homing(Effect):
         return Homing(self._begins(situation))
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """Time; whether that has pauses, `without_pauses` tells."""
-        return "" if "time" in covariates else "the time of each row, with pauses: time[s]"
-
-    def without_pauses(self, situation: Situation) -> str:
-        """What is missing in the times themselves, as in `missing`."""
-        most = situation.joints.shape[-2] // _SESSION_ROWS
-        if 1 <= len(self._begins(situation)) <= most:
-            return ""
-        return f"pauses in time[s], at least one and {most} at most, each of five minutes and 20 usual steps or longer"
+        """Time, or the order of the rows."""
+        return "" if "time" in covariates or ROW in covariates else "the time of each row: time[s]"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """One a joint and session."""
-        sessions = range(1, len(self._begins(situation)) + 2)
+        """One a joint and session; without pauses one a joint."""
         zeros = JointOffset().coefficients(situation)
-        return tuple(replace(zero, name=f"{zero.name} session {k}") for zero in zeros for k in sessions)
+        count = len(self._begins(situation))
+        names = [f"session {k + 1}" for k in range(count + 1)] if count else ["from then on"]
+        return tuple(replace(zero, name=f"{zero.name} {name}") for zero in zeros for name in names)
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """From when on the zeros are others; () where pauses tell."""
+        if len(self._begins(situation)):
+            return ()
+        whole = max(float(_passed(situation).max()), 1e-6)
+        unit = "s" if "time" in situation.covariates else ""
+        return (Shape("begin", unit, tuple(whole * k / _ZERO_BEGINS for k in range(1, _ZERO_BEGINS))),)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x (n · sessions)`."""
-        begins = self._begins(situation)
+        begins, joints = self._begins(situation), situation.joints.shape[-1]
         time = _passed(situation).expand(situation.joints.shape[:-1])
-        number = torch.bucketize(time.contiguous(), begins, right=True)
-        inside = torch.nn.functional.one_hot(number, len(begins) + 1).to(situation.joints.dtype)
-        return by_joint(inside.unsqueeze(-2).expand(*situation.joints.shape, -1))
+        after = time.unsqueeze(-1) >= (begins if len(begins) else shape).unsqueeze(-2)
+        if len(begins):
+            after = torch.nn.functional.one_hot(after.sum(-1), len(begins) + 1)
+        return by_joint(after.to(time.dtype).unsqueeze(-2).expand(*after.shape[:-1], joints, -1))
 
     def _begins(self, situation: Situation) -> Tensor:
         if self.begins is not None:
             return self.begins
+        if "time" not in situation.covariates:
+            return situation.joints.new_zeros(0)
         time = torch.unique(_passed(situation))
         steps = time.diff()
         usual = float(steps.median()) if len(steps) else 0.0
         begins: Tensor = time[1:][steps > max(_USUAL_STEPS * usual, _PAUSE)]
-        return begins
+        most = situation.joints.shape[-2] // _SESSION_ROWS
+        return begins if len(begins) <= most else begins[:0]
 
 
 ROW = "row"

@@ -78,6 +78,13 @@ _WORDS = {
         "How far the part gives for each unit of load on it.",
         "Bearings, gear and bolts of {where}: what gives under load.",
     ),
+    "thermal_compliance": Words(
+        "a stiffness that changes with the temperature",
+        "thermal change of stiffness",
+        "Change for each kelvin above 20 °C of how far the joint gives: for each unit of load, or under the machine's "
+        "own weight.",
+        "Belts, plastics, bearings and grease of {where}: what softens with warmth.",
+    ),
     "sag": Words(
         "joint compliance under the torque of the drives",
         "compliance",
@@ -105,9 +112,9 @@ _WORDS = {
         "Clamping of base, part and measuring device, and the warm-up of {where}.",
     ),
     "homing": Words(
-        "a new zero of the joints after each pause",
+        "a new zero of the joints after a pause, or from a row on",
         "new zero by session",
-        "The zero of each session between two pauses.",
+        "The zero of each session between two pauses, or before and after the time of begin.",
         "Homing of {where}: reference switch, index pulse or battery of the encoder. Home again, or measure the zero "
         "at each start: the next one has another, and commands are not corrected for it.",
     ),

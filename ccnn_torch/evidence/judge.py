@@ -108,12 +108,15 @@ def judge(
         return Verdict(chosen, classes, min(unknown, most), outside, drivers)
     # What names that are likely but not sure take away is no rest that the library lacks.
     if (rest := rest_of(chosen)) is not None and (likely is chosen or rest_of(likely) is not None):
-        # A set with a discrepancy term that leaves noise goes before one that does not. Where none does, what is only
-        # sure as one of a class is not named: the unknown cause can look like all of it.
+        # A set with a discrepancy term that leaves noise goes before one that does not. What is not sure beside such a
+        # term, or only sure as one of a class, is not named: the unknown cause can look like all of it.
         beside = [e for e in explanations if e.drivers]
-        certain = frozenset(n for n in chosen.names if marginal(explanations, n) >= NAMED)
-        same_names = (e for e in [*beside, *explanations] if e.names == certain)
-        other = next((e for e in beside if rest_of(e) is None), None) or next(same_names, chosen)
+        fits = next((e for e in beside if rest_of(e) is None), None)
+        told, given = (fits, beside) if fits else (chosen, explanations)
+        least = NAMED * sum(e.probability for e in given)
+        certain = frozenset(n for n in told.names if marginal(given, n) >= least)
+        others = ([fits] if fits else []) + [*beside, *explanations]
+        other = next((e for e in others if e.names == certain), told)
         return Verdict(other, {}, BESIDE_UNKNOWN, True, other.drivers or rest)
     inside = [e for e in explanations if not e.drivers]
     same = sum(e.probability for e in inside if is_same(e.names, chosen.names, classes))

@@ -191,7 +191,7 @@ def test_copies_of_rows_count_once() -> None:
 
 def test_noise_far_too_small_is_doubted() -> None:
     situation = rows_of("five_bar", 90, 9)
-    pose = measured(situation, {"backlash": 5.0}, 10)
+    pose = measured(situation, {"backlash": 10.0}, 10)
     found = diagnose_rows(situation, pose, noise=torch.full((3,), NOISE / 20, dtype=torch.float64), effects=FEW)
     assert any("it is too small" in caution for caution in found.cautions) and found.verdict["probability"] <= 0.9
 

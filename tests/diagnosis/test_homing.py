@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,7 @@ def measured(seed: int, wrong: str, days: int = 4, rows: int = 80) -> tuple[Situ
     sizes = draw.choice([-1, 1], 2) * draw.uniform(2e-4, 5e-4, 2)
     off = {
         "homing": draw.normal(0, 2e-4, (days, 2))[day],
+        "tooth": np.outer(np.arange(rows) >= rows * 0.6, [0.0, sizes[1]]),
         "drift": np.outer(time / time[-1], sizes),
         "joint_offset": np.tile(sizes, (rows, 1)),
     }
@@ -62,15 +64,25 @@ def test_pauses_alone_are_no_new_zeros(wrong: str) -> None:
         assert said["effects"] == ([wrong] if wrong else []), (seed, said)
 
 
-def test_it_needs_pauses_and_few_of_them() -> None:
+def test_it_needs_times_and_has_sessions_where_pauses_are_few() -> None:
     homing = make_effect("homing")
     assert "time[s]" in homing.missing(ARM, [])
-    assert not missing_on(homing, measured(0, "")[0])
-    for days in (1, 20):
-        assert "at least one and 13 at most" in missing_on(homing, measured(0, "", days)[0])
-    without = diagnose_rows(*measured(0, "drift", days=1))
-    assert "pauses in time[s]" in without.not_seen["homing"]
-    assert not any("homing" in entry["effects"] for entry in without.content["missing_covariates"])
+    # Without pauses, and with one at every other row, there is one new zero, of an unknown time.
+    for days, zeros in ((1, 2), (4, 8), (40, 2)):
+        rows, _ = measured(0, "", days)
+        assert not missing_on(homing, rows) and len(homing.coefficients(rows)) == zeros
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_a_zero_that_is_another_one_from_a_row_on_is_named_with_its_joint(timed: bool) -> None:
+    situation, poses = measured(3, "tooth", days=1)
+    if not timed:
+        situation = replace(situation, covariates={})
+    said = diagnose_rows(situation, poses, torch.full((3,), 1e-5, dtype=torch.float64))
+    assert said.verdict["effects"] == ["homing"] and not said.verdict["outside_library"]
+    assert said.verdict["shrink"] > 0.9
+    told = next(e for e in said.effects if e["name"] == "homing")["parameters"]
+    assert abs(told["q2 from then on"]["value"]) > 1.9e-4 and abs(told["q1 from then on"]["value"]) < 2e-5
 
 
 def test_geometry_is_fitted_beside_it_and_the_machine_has_no_zero_of_a_day() -> None:

@@ -21,7 +21,7 @@ LEFT = [
     ("tripod", "transmission", ["transmission"], 1e-3, 0.3),
     ("arm", "transmission", ["transmission"], 1e-3, 0.3),
     ("tripod", "backlash", ["backlash"], 0.3, 0.15),
-    ("arm", "backlash", ["backlash"], 0.1, 0.2),
+    ("arm", "backlash", ["backlash"], 0.1, 0.3),
     ("tripod", "compliance", ["compliance", "gravity"], 0.045, 0.06),
     ("machine_tool", "compliance", ["compliance", "gravity"], 0.055, 0.15),
     ("arm", "compliance", ["compliance", "gravity"], 0.045, 0.055),
@@ -61,7 +61,9 @@ def left(built: RealisticMachine, repeat: int, effects: list[str], secondary: bo
     if effects == ["transmission"]:
         shapes = [built.built.causes.frequency[repeat][:, 0].tolist()]
     elif len(effects) == 1:
-        grids = [shape.grid[::2] for shape in make_effect(effects[0]).shapes(rows)]
+        # The textbook has one value of most shapes, and no search.
+        every = make_effect(effects[0]).shapes(rows)
+        grids = [s.grid[::2] if secondary or s.usual is None else (s.usual,) for s in every]
         shapes = [list(values) for values in product(*grids)]
     shares = []
     for shape in shapes:

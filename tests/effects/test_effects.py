@@ -45,7 +45,19 @@ def test_the_example_of_an_own_effect_keeps_it_too() -> None:
 def test_the_library_has_its_order_and_a_line_for_people() -> None:
     assert list(EFFECTS) == [
         *("geometry", "joint_offset", "joint_gain", "transmission", "backlash", "friction", "compliance"),
-        *("sag", "gravity", "thermal", "drift", "homing", "frame", "tool", "coupling", "latency", "frame_drift"),
+        *(
+            "thermal_compliance",
+            "sag",
+            "gravity",
+            "thermal",
+            "drift",
+            "homing",
+            "frame",
+            "tool",
+            "coupling",
+            "latency",
+            "frame_drift",
+        ),
         *("flexure", "instrument"),
     ]
     assert OUTLIER not in EFFECTS
@@ -62,6 +74,7 @@ def test_the_library_has_its_order_and_a_line_for_people() -> None:
         ("compliance", "load_x[N] or load_y[N]"),
         ("sag", "torque_q1[N*m]"),
         ("thermal", "temperature[degC]"),
+        ("thermal_compliance", "temperature[degC]"),
         ("drift", "time[s]"),
         ("latency", "speed1[rad/s]"),
         ("tool", "a platform that turns"),

@@ -15,7 +15,7 @@ from ccnn_torch.api import identify
 from ccnn_torch.diagnosis import diagnose
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.records import load_records
+from ccnn_torch.records import load_records, write_table
 
 Array = NDArray[np.float64]
 GIVES = np.array([2e-6, 12e-6, 9e-6, 20e-6, 15e-6, 30e-6])
@@ -48,12 +48,12 @@ def _held(joints: Array, load: float, errors: Array) -> Array:
     return np.array([(energy(joints + one) - energy(joints - one)) / 2e-5 for one in steps])
 
 
-def _stands(command: Array, load: float, errors: Array) -> tuple[Array, Array]:
+def _stands(command: Array, load: float, errors: Array, gives: Array = GIVES) -> tuple[Array, Array]:
     """Where the springs let the tool of a command be, `4 x 4`, and the torques there."""
     joints = command
     for _ in range(8):
         torques = _held(joints, load, errors)
-        joints = command - GIVES * torques
+        joints = command - gives * torques
     at = np.eye(4)
     at[:3, 3] = TOOL
     return _links(joints, errors)[6] @ at, torques
@@ -93,6 +93,23 @@ def test_what_each_joint_gives_for_its_measured_torque_is_told(geometry: float, 
         block = found[f"q{joint}"]
         # The records have the torque with which a drive holds: the joint gives the other way.
         assert abs(block["value"] + gives) < 4 * block["sd"] + 0.02 * gives and block["sd"] < 0.1 * gives
+
+
+def test_springs_that_soften_with_warmth_are_told_beside_what_they_give(tmp_path: Path) -> None:
+    draw, warm, path = np.random.default_rng(1), 6 * np.sin(np.linspace(0, 5, 60)), tmp_path / "arm.yaml"
+    path.write_text(arm_text(f"base_frame: identity\ntool_frame: [{', '.join(map(str, TOOL))}, 0, 0, 0]\n"))
+    joints = draw.uniform([-2.5, -2.2, 0.4, -2.5, -2.2, -3], [2.5, -0.6, 2.2, 0.5, -0.4, 3], (60, 6))
+    gives = GIVES * (1 + 0.05 * warm[:, None])
+    frames = [_stands(q, 0.0, np.zeros((4, 6)), c)[0] for q, c in zip(joints, gives, strict=True)]
+    turns = Rotation.from_matrix([at[:3, :3] for at in frames]) * Rotation.from_rotvec(draw.normal(0, 5e-5, (60, 3)))
+    pose = np.c_[[at[:3, 3] for at in frames] + draw.normal(0, NOISE, (60, 3)), turns.as_rotvec()]
+    names = [*(f"q{i + 1}[rad]" for i in range(6)), "x[m]", "y[m]", "z[m]", "rx[rad]", "ry[rad]", "rz[rad]"]
+    table = dict(zip([*names, "temperature[degC]"], np.c_[joints, pose, 20 + warm].T, strict=True))
+    write_table(tmp_path / "r.csv", table)
+    arm = load_mechanism(str(path))
+    effects = ["joint_offset", "gravity", "thermal", "thermal_compliance"]
+    said = diagnose(load_records(tmp_path / "r.csv", arm), arm, effects=effects)
+    assert set(said.verdict["effects"]) == {"gravity", "thermal_compliance"} and said.verdict["shrink"] > 0.99
 
 
 def test_identify_does_not_bend_the_geometry_to_what_joints_give(tmp_path: Path) -> None:

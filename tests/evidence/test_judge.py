@@ -107,6 +107,9 @@ def test_a_set_that_leaves_more_than_the_noise_has_something_outside_beside_it()
     assert said(verdict(shares, "a", "b|time")) == ({"a"}, 0.6, True, ("load x",))
     assert said(verdict(shares, *shares)) == ({"a"}, 0.6, True, ("load x",))
     assert said(verdict({"a": 1.0}, "a")) == ({"a"}, 0.6, True, ("rest",))
+    # Beside something unknown a is not sure any more.
+    unsure = {"a": 0.9, "a|time": 0.06, "|time": 0.04}
+    assert said(verdict(unsure, "a")) == (set(), 0.6, True, ("time",))
     # Neither b nor c is sure, though one of them is.
     either = {"a b": 0.5, "a c": 0.44, "a": 0.03, "a|time": 0.02, "b|load x": 0.01}
     assert said(verdict(either, *either)) == ({"a"}, 0.6, True, ("time",))

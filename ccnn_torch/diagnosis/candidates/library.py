@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows, Shape
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.rows import only_usable
 from ccnn_torch.diagnosis.residual.whitening import Whitening
-from ccnn_torch.effects import Acting, Effect, Situation
+from ccnn_torch.effects import EXACT, Acting, Effect, Situation
 from ccnn_torch.effects.joints import Coupling
 from ccnn_torch.evidence.marginal_likelihood import GroupProducts, Prior, fit_single_groups, own_products
 from ccnn_torch.evidence.priors import EFFECT
@@ -81,6 +81,7 @@ def candidates_about_nominal(
         for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(without_unused_rows(_atom(situation, situation, atom.effect, shaped), usable))
+    starts += _in_few_joints(situation, starts, white, residual)
     return [*map(_charged, [*whole, *parts]), *starts]
 
 
@@ -155,7 +156,7 @@ def candidates_about_set(
         for shaped in shapes:
             if not any(_same_shape(a, shaped) for a in own):
                 own.append(without_unused_rows(_atom(situation, there, effect, shaped), usable))
-        atoms += own
+        atoms += [*own, *_in_few_joints(situation, own, white, beside(others))]
     return atoms
 
 
@@ -264,6 +265,15 @@ def single_joint_atoms(
         _with(atom, (c := choices[k]).chosen, c.lots * c.charge) if k in choices else None
         for k, atom in enumerate(atoms)
     ]
+
+
+def _in_few_joints(situation: Situation, shaped: Sequence[Atom], white: Whitening, y: Tensor) -> list[Atom]:
+    """Of effects with shapes, whose form is exact, those in few joints: what it would be in the others mends nothing.
+
+    y: what they are to explain, `s x c0` [m, rad].
+    """
+    exact = [a for a in shaped if a.name in EXACT and a.used is None]
+    return [one for one in single_joint_atoms(situation, exact, white, [y] * len(exact)) if one is not None]
 
 
 def without_secondary(situation: Situation, atoms: Sequence[Atom]) -> list[Atom]:

@@ -21,7 +21,7 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.findings import size_words
 from ccnn_torch.diagnosis.verdict.judgement import Judgement, implausible_size
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
-from ccnn_torch.diagnosis.verdict.remainder import times_the_noise
+from ccnn_torch.diagnosis.verdict.remainder import times_as_scatter, times_the_noise
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
 from ccnn_torch.effects.time import ROW
@@ -179,6 +179,7 @@ def _of_noise(analysis: Analysis, judgement: Judgement) -> list[Caution]:
         quiet = f"the rows scatter by {number_text(left, 2)} times the noise that was given"
         return [Caution(f"{quiet}: with less of it smaller causes would show")]
     times = times_the_noise(analysis, min(analysis.found, key=lambda f: f.rss))
+    times = times_as_scatter(analysis, found) if times <= 1 else times
     # Of a noise that the records show an outside cause says as much.
     if times <= 1 or (judgement.outside and not analysis.whitening.known):
         return []

@@ -18,7 +18,7 @@ from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Effect, Situation, missing_on, pose_residual
 from ccnn_torch.effects.backlash import Backlash
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
-from ccnn_torch.effects.time import ROW, FrameDrift
+from ccnn_torch.effects.time import ROW, FrameDrift, Homing
 from ccnn_torch.errors import InputError
 from ccnn_torch.evidence.dictionary import gain_beside
 from ccnn_torch.records.commanded import SECOND
@@ -111,33 +111,36 @@ class OfOrder(NamedTuple):
     """Columns that the order of the rows tells where they were not recorded.
 
     Attributes:
-        effect: what they would show.
+        effects: what they would show.
         columns: of rows and an order of theirs, by name, `s` each.
         clearly: log odds that they must gain, and times what random orders gain.
         every: of each grid of its shapes every so many values are tried, from the first on; () = the middle ones.
     """
 
-    effect: Effect
+    effects: tuple[Effect, ...]
     columns: Callable[[Situation, Tensor], dict[str, Tensor]]
     clearly: tuple[float, float]
     every: tuple[int, ...] = ()
 
     def signatures(self, there: Situation) -> list[Tensor]:
-        """Of the effect at each of the shapes tried, `s x c x m` each; there: rows with the columns."""
-        shapes = [default_shape(there, self.effect)]
-        if self.every:
-            grids = [s.grid[::n] for s, n in zip(self.effect.shapes(there), self.every, strict=True)]
-            shapes = [torch.tensor(values, dtype=torch.float64) for values in product(*grids)]
-        return [scaled_signature(there, self.effect, shape) for shape in shapes]
+        """Of the effects at each of the shapes tried, `s x c x m` each; there: rows with the columns."""
+        found = []
+        for effect in self.effects:
+            shapes = [default_shape(there, effect)]
+            if self.every:
+                grids = [s.grid[::n] for s, n in zip(effect.shapes(there), self.every, strict=False)]
+                shapes = [torch.tensor(values, dtype=torch.float64) for values in product(*grids)]
+            found += [scaled_signature(there, effect, shape) for shape in shapes]
+        return found
 
 
 def of_order(situation: Situation) -> dict[str, OfOrder]:
     """Kinds of columns that are not there: `direction`, and `row`, which stands for the time."""
-    found = {} if situation.directed else {"direction": OfOrder(Backlash(), _directions, _DIRECTIONS)}
+    found = {} if situation.directed else {"direction": OfOrder((Backlash(),), _directions, _DIRECTIONS)}
     return (
         found
         if "time" in situation.covariates
-        else found | {ROW: OfOrder(FrameDrift(), _numbers, _ROWS_IN_ORDER, (5, 3))}
+        else found | {ROW: OfOrder((FrameDrift(), Homing()), _numbers, _ROWS_IN_ORDER, (5, 3))}
     )
 
 

@@ -88,10 +88,22 @@ def rest_of(analysis: Analysis, found: FittedSet) -> tuple[str, ...] | None:
 
 def times_the_noise(analysis: Analysis, found: FittedSet) -> float:
     """Standard deviation of what a set leaves, over that of the noise; 1 where it is no clearly more than that."""
-    if not is_unexplained(analysis.dictionary, found, analysis.floor):
-        return 1.0
+    return _times(analysis, found) if is_unexplained(analysis.dictionary, found, analysis.floor) else 1.0
+
+
+def _times(analysis: Analysis, found: FittedSet) -> float:
     free = max(analysis.dictionary.grams.values - found.effective, 1.0)
     return float((found.rss / free / max(analysis.floor, 1e-300)) ** 0.5)
+
+
+def times_as_scatter(analysis: Analysis, found: FittedSet) -> float:
+    """As `times_the_noise` without an allowance for form errors: these follow what their effects follow.
+
+    1 where what is left may be a form error, since it follows something, and where it is not many times the noise.
+    """
+    times = _times(analysis, found)
+    rest = remainder_of(analysis, found) if times > _MANY_TIMES else None
+    return 1.0 if rest is None or rest.probability < _UNLIKELY else times
 
 
 class _Left(NamedTuple):
