@@ -53,10 +53,10 @@ class Compensator(nn.Module):
     """The correction of commanded joints: a bounded deviation δ(q), and the command that undoes it.
 
     Sign: δ is what the machine does beyond the command, ideal = q + δ(q); the command for ideal joints q* solves
-    q + δ(q) = q* by `iterations` steps from q*: of q ← q* - δ(q), or with `secant` of Broyden's method, which gains
-    more with each. δ is `scaling.restore(network(features))` clamped to ± `limit`, faded by the domain's guard into the
-    constant `safe`. Inputs that are not finite (the middle of the domain is taken for what is no number, its edge for
-    infinity) are commanded as they are, without any correction.
+    q + δ(q) = q* by `iterations` steps from q* - `safe`: of q ← q* - δ(q), or with `secant` of Broyden's method, which
+    gains more with each. δ is `scaling.restore(network(features))` clamped to ± `limit`, faded by the domain's guard
+    into the constant `safe`. Inputs that are not finite (the middle of the domain is taken for what is no number, its
+    edge for infinity) are commanded as they are, without any correction.
 
     With a `machine` the network has learned only what that leaves, and the limit and the guard hold for the network
     alone: the machine inverts its own forward map, with what was learned in it, in `iterations` steps, and the whole
@@ -77,8 +77,8 @@ class Compensator(nn.Module):
         safe_sd: standard deviation outside the domain, `n` [SI].
         joints, covariates: coordinates in order.
         lipschitz: bound of |∂δ/∂q| with joints in units of their limits (maximum row sum), 1.
-        iterations: smallest k with lipschitzᵏ · max|δ| below 1e-12 of the limit; with `secant` or a `machine` the
-            smallest with which the command has settled at thousands of points in and around the domain.
+        iterations: smallest k with which the command has settled, to 1e-12 of the limit and rounding, at thousands of
+            points in and around the domain; without a `machine` at most that with lipschitzᵏ · max|δ| below it.
         secant: whether steps are those of Broyden's method.
         share: of what the network learned beside its mean that is applied [1]; below 1 where all of it was too steep.
             The scaling has it already, and a model file does not store it.
@@ -260,8 +260,8 @@ class Compensator(nn.Module):
     def _learned(self, joints: Tensor, covariates: Tensor | None) -> tuple[Learned, Tensor]:
         """What was learned at commanded joints, and how many inputs were not finite, `... x 1`."""
         functions = Functions(self)
-        _, q, x, strange, known = functions.clean(self._inputs(joints, covariates)).values()
-        return functions.learned(q, x, strange, known), strange
+        found = functions.clean(self._inputs(joints, covariates))
+        return functions.learned(found["q"], found["x"], found["strange"], found["known"]), found["strange"]
 
     def _inputs(self, joints: Tensor, covariates: Tensor | None) -> Tensor:
         """Joints and covariates side by side, `... x (n + m)` [SI]."""
