@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -22,6 +22,8 @@ from ccnn_torch.training import Scaling
 
 # What is left of the equation q + δ(q) = q*, as a share of the limit.
 TOLERANCE = 1e-12
+# What can be asked for.
+WAYS = ("command", "back", "sd")
 
 Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
 
@@ -146,12 +148,12 @@ class Compensator(nn.Module):
         Raises:
             InputError: covariates are missing, or a last dimension is wrong.
         """
-        found = self.solve(joints, covariates)
-        return found.command, found.deviation, found.inside_domain
+        found = self.run(joints, covariates, ("command",))
+        return found["command"], found["deviation"], found["inside_domain"]
 
     def deviation(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """δ at *commanded* joints, `... x n` [SI]: that of the way back; arguments and errors as `forward`."""
-        return self._run(joints, covariates, 1)["back_deviation"]
+        return self.run(joints, covariates, ("back",))["back_deviation"]
 
     def learned(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Guarded and limited part that was learned, at *commanded* joints, `... x n` [SI]; as `forward`."""
@@ -181,12 +183,20 @@ class Compensator(nn.Module):
 
     def back(self, command: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Ideal joints of a command (or of the joints fed back), `... x n` [SI]; arguments and errors as `forward`."""
-        return self._run(command, covariates, 1)["ideal"]
+        return self.run(command, covariates, ("back",))["ideal"]
 
     def solve(self, joints: Tensor, covariates: Tensor | None = None) -> Solution:
         """Command of ideal joints, and the ideal joints were they a command; arguments and errors as `forward`."""
-        found = self._run(joints, covariates, 0, 1)
+        found = self.run(joints, covariates)
         return Solution(*(found[name] for name in Solution._fields))
+
+    def run(self, joints: Tensor, covariates: Tensor | None = None, ways: Collection[str] = WAYS) -> Variables:
+        """What is asked for, by name; each of `WAYS` costs its own evaluations. Arguments and errors as `forward`."""
+        functions, sd = Functions(self), "sd" in ways
+        every = routines_of(self, KEPT, sd, ("sure",) if sd else ())
+        asked = [routine for routine, way in zip(every, WAYS, strict=False) if way in ways or (sd and way == "command")]
+        values = functions.start(self._inputs(joints, covariates))
+        return reduce(lambda found, routine: functions.run(routine.statements, found), asked, values)
 
     def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `solve`, for deviations and weights instead of joints, which single precision cannot hold.
@@ -195,7 +205,7 @@ class Compensator(nn.Module):
             δ at the command `... x n` [SI], its weight `... x 1` [1] (1 inside the domain); δ and weight were the
             joints given a command.
         """
-        found = self._run(joints, covariates, 0, 1)
+        found = self.run(joints, covariates)
         return found["deviation"], found["guard"], found["back_deviation"], found["back_guard"]
 
     @property
@@ -250,12 +260,6 @@ class Compensator(nn.Module):
     def limited(self, deviation: Tensor) -> Tensor:
         """Within the limit."""
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
-
-    def _run(self, joints: Tensor, covariates: Tensor | None, *routines: int) -> Variables:
-        """Variables after the command (0) or the way back (1)."""
-        functions, every = Functions(self), routines_of(self, KEPT)
-        values = functions.start(self._inputs(joints, covariates))
-        return reduce(lambda found, k: functions.run(every[k].statements, found), routines, values)
 
     def _learned(self, joints: Tensor, covariates: Tensor | None) -> tuple[Learned, Tensor]:
         """What was learned at commanded joints, and how many inputs were not finite, `... x 1`."""

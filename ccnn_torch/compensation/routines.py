@@ -122,12 +122,15 @@ def next_step(own: Compensator) -> tuple[Statement, ...]:
     return Copy("correction", "found"), "step"
 
 
-def routines_of(own: Compensator, kept: Sequence[Copy] = (), last: bool = True) -> list[Routine]:
+def routines_of(
+    own: Compensator, kept: Sequence[Copy] = (), last: bool = True, ends: Sequence[str] = ()
+) -> list[Routine]:
     """Command and way back.
 
     Args:
         kept: what the end of a machine's command needs of its first step, beside `first` and `near`.
         last: whether the model without a machine is evaluated once more, at the command itself.
+        ends: functions that are called after the command.
     """
     start: tuple[Statement, ...] = ("clean", Copy("correction"))
     again = Repeat(own.iterations, next_step(own))
@@ -144,7 +147,7 @@ def routines_of(own: Compensator, kept: Sequence[Copy] = (), last: bool = True) 
     about_back = "The way back: ideal joints of a command, or of joints fed back."
     blank = (Copy("steps"),) if own.secant else ()
     return [
-        Routine("compensate", about, "joints", ("command", "deviation"), (*start, *blank, *command)),
+        Routine("compensate", about, "joints", ("command", "deviation"), (*start, *blank, *command, *ends)),
         Routine("ideal", about_back, "command", ("joints",), (*start, *back)),
     ]
 
@@ -342,7 +345,6 @@ class Functions:
         correction: Tensor,
         excess: Tensor,
         weight: Tensor,
-        features: Tensor,
         doubt: Tensor,
     ) -> Variables:
         inside, correction = excess <= 0, known * correction
@@ -352,8 +354,10 @@ class Functions:
             "inside_domain": inside.squeeze(-1),
             "guard": weight,
             "status": self.status(strange, inside, doubt).squeeze(-1),
-            "deviation_sd": torch.where(strange <= 0, self.own.sd_of(weight, features), self.own.fallback_sd),
         }
+
+    def sure(self, strange: Tensor, weight: Tensor, features: Tensor) -> Variables:
+        return {"deviation_sd": torch.where(strange <= 0, self.own.sd_of(weight, features), self.own.fallback_sd)}
 
     def choose(
         self,
@@ -373,7 +377,8 @@ class Functions:
         good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
         both = zip((correction, excess, weight, features), (first, near, near_weight, near_features), strict=True)
         taken, excess, weight, features = (torch.where(good, *pair) for pair in both)
-        return self.finish(ideal, strange, known, taken, excess, weight, features, doubt)
+        found = self.finish(ideal, strange, known, taken, excess, weight, doubt)
+        return found | {"weight": weight, "features": features}
 
     def finish_back(
         self,

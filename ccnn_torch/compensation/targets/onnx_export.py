@@ -82,10 +82,9 @@ class GraphFunctions(Functions):
         correction: Tensor,
         excess: Tensor,
         weight: Tensor,
-        features: Tensor,
         doubt: Tensor,
     ) -> Variables:
-        return super().finish(ideal, strange, known, correction, excess + strange, known * weight, features, doubt)
+        return super().finish(ideal, strange, known, correction, excess + strange, known * weight, doubt)
 
     def finish_back(
         self,
@@ -135,7 +134,8 @@ def command_graph(
     n, m = len(compensator.joints), len(compensator.covariates)
     rows, functions = rows_apart_from(compensator), GraphFunctions(compensator)
     examples = functions.start(compensator.domain.centre.repeat(rows, 1))
-    routines = routines_of(compensator, KEPT, last="deviation_sd" in outputs)
+    sd = "deviation_sd" in outputs
+    routines = routines_of(compensator, KEPT, sd, ("sure",) if sd else ())
     with torch.no_grad():
         for routine in routines:
             functions.run(routine.statements, examples)
