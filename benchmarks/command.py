@@ -14,6 +14,8 @@ import torch
 
 from benchmarks.measure import Row, compare
 from ccnn_torch.compensation import load_model
+from ccnn_torch.compensation.targets.export import COMMAND
+from ccnn_torch.compensation.targets.onnx_export import export_onnx
 
 
 def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
@@ -26,6 +28,7 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
     feeds = dict(zip(("joints", "covariates"), (t.numpy() for t in tensors), strict=False))
     single = {name: value.astype(np.float32) for name, value in feeds.items()}
     double_session, single_session = session(model / "model.onnx"), session(model / "model.float32.onnx")
+    alone = session(export_onnx(compensator, "{}", COMMAND))
 
     def eager() -> Any:
         with torch.inference_mode():
@@ -38,10 +41,11 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
         eager,
         {
             "ONNX Runtime, float64": lambda: double_session.run(None, feeds),
+            "ONNX Runtime, float64, the command alone": lambda: alone.run(None, feeds),
             "ONNX Runtime, float32": lambda: single_session.run(None, single),
         },
-        note="single calls of ONNX Runtime, float64: p50 {:.0f} µs, p99 {:.0f} µs".format(
-            *percentiles(lambda: double_session.run(None, feeds), 1000 if quick else 10_000)
+        note="single calls of ONNX Runtime, float64, the command alone: p50 {:.0f} µs, p99 {:.0f} µs".format(
+            *percentiles(lambda: alone.run(None, feeds), 1000 if quick else 10_000)
         ),
     )
 
@@ -57,7 +61,7 @@ def percentiles(call: Callable[[], Any], calls: int) -> tuple[float, float]:
     return cut[49], cut[98]
 
 
-def session(path: Path) -> onnxruntime.InferenceSession:
+def session(path: Path | bytes) -> onnxruntime.InferenceSession:
     """ONNX Runtime on one thread, as a controller would run it."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -22,6 +22,8 @@ from ccnn_torch.training import Scaling
 
 # What is left of the equation q + δ(q) = q*, as a share of the limit.
 TOLERANCE = 1e-12
+# What can be asked for.
+WAYS = ("command", "back", "sd")
 
 Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
 
@@ -53,10 +55,10 @@ class Compensator(nn.Module):
     """The correction of commanded joints: a bounded deviation δ(q), and the command that undoes it.
 
     Sign: δ is what the machine does beyond the command, ideal = q + δ(q); the command for ideal joints q* solves
-    q + δ(q) = q* by `iterations` steps from q*: of q ← q* - δ(q), or with `secant` of Broyden's method, which gains
-    more with each. δ is `scaling.restore(network(features))` clamped to ± `limit`, faded by the domain's guard into the
-    constant `safe`. Inputs that are not finite (the middle of the domain is taken for what is no number, its edge for
-    infinity) are commanded as they are, without any correction.
+    q + δ(q) = q* by `iterations` steps from q* - `safe`: of q ← q* - δ(q), or with `secant` of Broyden's method, which
+    gains more with each. δ is `scaling.restore(network(features))` clamped to ± `limit`, faded by the domain's guard
+    into the constant `safe`. Inputs that are not finite (the middle of the domain is taken for what is no number, its
+    edge for infinity) are commanded as they are, without any correction.
 
     With a `machine` the network has learned only what that leaves, and the limit and the guard hold for the network
     alone: the machine inverts its own forward map, with what was learned in it, in `iterations` steps, and the whole
@@ -77,8 +79,8 @@ class Compensator(nn.Module):
         safe_sd: standard deviation outside the domain, `n` [SI].
         joints, covariates: coordinates in order.
         lipschitz: bound of |∂δ/∂q| with joints in units of their limits (maximum row sum), 1.
-        iterations: smallest k with lipschitzᵏ · max|δ| below 1e-12 of the limit; with `secant` or a `machine` the
-            smallest with which the command has settled at thousands of points in and around the domain.
+        iterations: smallest k with which the command has settled, to 1e-12 of the limit and rounding, at thousands of
+            points in and around the domain; without a `machine` at most that with lipschitzᵏ · max|δ| below it.
         secant: whether steps are those of Broyden's method.
         share: of what the network learned beside its mean that is applied [1]; below 1 where all of it was too steep.
             The scaling has it already, and a model file does not store it.
@@ -146,12 +148,12 @@ class Compensator(nn.Module):
         Raises:
             InputError: covariates are missing, or a last dimension is wrong.
         """
-        found = self.solve(joints, covariates)
-        return found.command, found.deviation, found.inside_domain
+        found = self.run(joints, covariates, ("command",))
+        return found["command"], found["deviation"], found["inside_domain"]
 
     def deviation(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """δ at *commanded* joints, `... x n` [SI]: that of the way back; arguments and errors as `forward`."""
-        return self._run(joints, covariates, 1)["back_deviation"]
+        return self.run(joints, covariates, ("back",))["back_deviation"]
 
     def learned(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Guarded and limited part that was learned, at *commanded* joints, `... x n` [SI]; as `forward`."""
@@ -181,12 +183,20 @@ class Compensator(nn.Module):
 
     def back(self, command: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Ideal joints of a command (or of the joints fed back), `... x n` [SI]; arguments and errors as `forward`."""
-        return self._run(command, covariates, 1)["ideal"]
+        return self.run(command, covariates, ("back",))["ideal"]
 
     def solve(self, joints: Tensor, covariates: Tensor | None = None) -> Solution:
         """Command of ideal joints, and the ideal joints were they a command; arguments and errors as `forward`."""
-        found = self._run(joints, covariates, 0, 1)
+        found = self.run(joints, covariates)
         return Solution(*(found[name] for name in Solution._fields))
+
+    def run(self, joints: Tensor, covariates: Tensor | None = None, ways: Collection[str] = WAYS) -> Variables:
+        """What is asked for, by name; each of `WAYS` costs its own evaluations. Arguments and errors as `forward`."""
+        functions, sd = Functions(self), "sd" in ways
+        every = routines_of(self, KEPT, sd, ("sure",) if sd else ())
+        asked = [routine for routine, way in zip(every, WAYS, strict=False) if way in ways or (sd and way == "command")]
+        values = functions.start(self._inputs(joints, covariates))
+        return reduce(lambda found, routine: functions.run(routine.statements, found), asked, values)
 
     def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `solve`, for deviations and weights instead of joints, which single precision cannot hold.
@@ -195,7 +205,7 @@ class Compensator(nn.Module):
             δ at the command `... x n` [SI], its weight `... x 1` [1] (1 inside the domain); δ and weight were the
             joints given a command.
         """
-        found = self._run(joints, covariates, 0, 1)
+        found = self.run(joints, covariates)
         return found["deviation"], found["guard"], found["back_deviation"], found["back_guard"]
 
     @property
@@ -251,17 +261,11 @@ class Compensator(nn.Module):
         """Within the limit."""
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
 
-    def _run(self, joints: Tensor, covariates: Tensor | None, *routines: int) -> Variables:
-        """Variables after the command (0) or the way back (1)."""
-        functions, every = Functions(self), routines_of(self, KEPT)
-        values = functions.start(self._inputs(joints, covariates))
-        return reduce(lambda found, k: functions.run(every[k].statements, found), routines, values)
-
     def _learned(self, joints: Tensor, covariates: Tensor | None) -> tuple[Learned, Tensor]:
         """What was learned at commanded joints, and how many inputs were not finite, `... x 1`."""
         functions = Functions(self)
-        _, q, x, strange, known = functions.clean(self._inputs(joints, covariates)).values()
-        return functions.learned(q, x, strange, known), strange
+        found = functions.clean(self._inputs(joints, covariates))
+        return functions.learned(found["q"], found["x"], found["strange"], found["known"]), found["strange"]
 
     def _inputs(self, joints: Tensor, covariates: Tensor | None) -> Tensor:
         """Joints and covariates side by side, `... x (n + m)` [SI]."""

@@ -199,7 +199,7 @@ def fit_compensator(
             compensator.lipschitz, compensator.share = found.lipschitz, share
             compensator.iterations = iterations_needed(found)
             if machine is None:
-                _accelerate(compensator, inputs)
+                _count_steps(compensator, inputs)
             else:
                 settle(compensator, inputs)
             return compensator
@@ -227,26 +227,28 @@ def _with_known(
 
 
 @torch.no_grad()
-def _accelerate(compensator: Compensator, inputs: Tensor) -> None:
-    """Let Broyden's method find the command where that takes fewer steps; inputs: training inputs, `s x (n + m)`.
+def _count_steps(compensator: Compensator, inputs: Tensor) -> None:
+    """Steps that the command takes, those of Broyden's method where it takes fewer; inputs: `s x (n + m)` [SI].
 
-    Steps are counted until d = δ(q - d) holds at points in and around the domain, to what exports are right to and the
-    rounding of a command.
+    They are counted until d = δ(q - d) holds at points in and around the domain, to what exports are right to and the
+    rounding of a command and of its sum with δ. The steepest slope is met at few points, and by few steps.
     """
     most = compensator.iterations
-    if most <= _GENTLE_STEPS:
-        return
-    compensator.secant = True
+    best = most, False
     points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED)
-    functions, values = _begun(compensator, points, most)
-    rounding = torch.finfo(points.dtype).eps * values["q"].abs()
-    allowed = compensator.export_tolerance * compensator.limit + rounding
-    for count in range(1, most):
-        functions.run(next_step(compensator), values)
-        if bool(((values["found"] - values["correction"]).abs() <= allowed).all()):
-            compensator.iterations = count
-            return
-    compensator.secant = False
+    for secant in (False, True):
+        compensator.secant = secant
+        functions, values = _begun(compensator, points, most)
+        rounding = 2 * torch.finfo(points.dtype).eps * values["q"].abs()
+        allowed = compensator.export_tolerance * compensator.limit + rounding
+        for count in range(1, best[0]):
+            functions.run(next_step(compensator), values)
+            if bool(((values["found"] - values["correction"]).abs() <= allowed).all()):
+                best = count, secant
+                break
+        if best[0] <= _GENTLE_STEPS:
+            break
+    compensator.iterations, compensator.secant = best
 
 
 @torch.no_grad()

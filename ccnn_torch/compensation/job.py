@@ -33,8 +33,8 @@ from ccnn_torch.units import from_si, si_unit_of
 # Joints all over the measured region, among which the first row's guess is looked for.
 _LOOKED_AT = 2000
 _LARGEST = 500_000_000
-ROWS = 1024
-"""Rows that a model takes at once: its calls count for nothing then, and it takes a hundred MB."""
+ROWS = 4096
+"""Rows that a model takes at once: its calls count for little then, and it takes a hundred MB."""
 
 
 Array: TypeAlias = NDArray[Any]
@@ -291,7 +291,7 @@ def write_compensated(
             with warnings.catch_warnings():
                 # Reported at the end, with the line of the table.
                 warnings.simplefilter("ignore", FallbackWarning)
-                found = loaded(joints, covariates)
+                found = loaded(joints, covariates, ("back",) if back else ("command", "sd") if sd else ("command",))
             if sd and "deviation_sd" not in found:
                 raise InputError(
                     f"--sd: {loaded.path} is identified geometry, which has no standard deviation of a command"
@@ -343,10 +343,9 @@ def _added(
         }
 
     if shown is not None:
-        found = found | {name: shown.shown(found[name]) for name in ("command", "ideal")}
-        found["deviation"] = shown.change_shown(found["deviation"])
-        if sd:
-            found["deviation_sd"] = shown.spread_shown(found["deviation_sd"])
+        kinds = {"command": shown.shown, "ideal": shown.shown, "deviation": shown.change_shown}
+        kinds["deviation_sd"] = shown.spread_shown
+        found = found | {name: show(found[name]) for name, show in kinds.items() if name in found}
     if back:
         flags = {"inside_domain[1]": found["ideal_inside_domain"], "status[1]": found["ideal_status"]}
         return named("ideal", found["ideal"]) | flags

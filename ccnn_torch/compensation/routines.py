@@ -122,15 +122,21 @@ def next_step(own: Compensator) -> tuple[Statement, ...]:
     return Copy("correction", "found"), "step"
 
 
-def routines_of(own: Compensator, kept: Sequence[Copy] = ()) -> list[Routine]:
+def routines_of(
+    own: Compensator, kept: Sequence[Copy] = (), last: bool = True, ends: Sequence[str] = ()
+) -> list[Routine]:
     """Command and way back.
 
     Args:
         kept: what the end of a machine's command needs of its first step, beside `first` and `near`.
+        last: whether the model without a machine is evaluated once more, at the command itself.
+        ends: functions that are called after the command.
     """
     start: tuple[Statement, ...] = ("clean", Copy("correction"))
     again = Repeat(own.iterations, next_step(own))
-    command: tuple[Statement, ...] = ("step", again, "finish")
+    but_one = Repeat(own.iterations - 1, next_step(own))
+    # What was learned is nearer to its mean than to 0.
+    command = Copy("correction", "start"), "step", but_one, *next_step(own)[: None if last else -1], "finish"
     back: tuple[Statement, ...] = ("step", "finish_back")
     if own.machine is not None:
         # The first step is taken where the last one goes astray.
@@ -141,7 +147,7 @@ def routines_of(own: Compensator, kept: Sequence[Copy] = ()) -> list[Routine]:
     about_back = "The way back: ideal joints of a command, or of joints fed back."
     blank = (Copy("steps"),) if own.secant else ()
     return [
-        Routine("compensate", about, "joints", ("command", "deviation"), (*start, *blank, *command)),
+        Routine("compensate", about, "joints", ("command", "deviation"), (*start, *blank, *command, *ends)),
         Routine("ideal", about_back, "command", ("joints",), (*start, *back)),
     ]
 
@@ -197,7 +203,7 @@ def status_of(strange: Tensor, inside: Tensor, doubt: Tensor | None = None) -> T
     if doubt is not None:
         # Written so that what is no number is not exact.
         found = torch.where(doubt <= 0, found, DAMPED)
-    return torch.where(strange > 0, NOT_FINITE, found)
+    return torch.where(strange <= 0, found, NOT_FINITE)
 
 
 class Learned(NamedTuple):
@@ -219,10 +225,10 @@ class Functions:
 
     Every function takes variables as parameters of their names and gives others. Variables: `inputs` as given; `ideal`
     and `x` joints and covariates made finite, `q` those joints as they are looked at; `strange`, how many inputs were
-    not finite, and `known`, 1 where all were, else 0; `aim` of a machine; `correction` tried, `found` to try next,
-    `doubt` above 0 where `correction` is not the exact one; the guard's `excess`, above 0 outside the domain, its
-    `weight` and the network's `features`; `first` and `near…`, `found` and the others of the first step; `steps` of
-    Broyden's method, with `next` and `done` to follow.
+    not finite, and `known`, 1 where all were, else 0; `start`, the first correction; `aim` of a machine; `correction`
+    tried, `found` to try next, `doubt` above 0 where `correction` is not the exact one; the guard's `excess`, above 0
+    outside the domain, its `weight` and the network's `features`; `first` and `near…`, `found` and the others of the
+    first step; `steps` of Broyden's method, with `next` and `done` to follow.
     """
 
     def __init__(self, own: Compensator, room: int = 0) -> None:
@@ -264,7 +270,8 @@ class Functions:
             room = torch.cat([own.limit, own.limit.new_zeros(len(own.covariates))])
             at = torch.minimum(torch.maximum(finite, domain._cage_low - room), domain._cage_high + room)
         known = 1 - torch.clamp(strange, 0.0, 1.0)
-        return {"ideal": finite[..., :n], "q": at[..., :n], "x": at[..., n:], "strange": strange, "known": known}
+        found = {"ideal": finite[..., :n], "q": at[..., :n], "x": at[..., n:], "strange": strange, "known": known}
+        return found | {"start": own.safe.expand_as(found["q"])}
 
     def excess(self, caged: Tensor) -> Tensor:
         """How far beyond the margin, `... x 1` [1]."""
@@ -334,22 +341,23 @@ class Functions:
         self,
         ideal: Tensor,
         strange: Tensor,
+        known: Tensor,
         correction: Tensor,
-        found: Tensor,
         excess: Tensor,
         weight: Tensor,
-        features: Tensor,
         doubt: Tensor,
     ) -> Variables:
-        inside = excess <= 0
+        inside, correction = excess <= 0, known * correction
         return {
             "command": ideal - correction,
-            "deviation": found,
+            "deviation": correction,
             "inside_domain": inside.squeeze(-1),
             "guard": weight,
-            "status": status_of(strange, inside, doubt).squeeze(-1),
-            "deviation_sd": torch.where(strange <= 0, self.own.sd_of(weight, features), self.own.fallback_sd),
+            "status": self.status(strange, inside, doubt).squeeze(-1),
         }
+
+    def sure(self, strange: Tensor, weight: Tensor, features: Tensor) -> Variables:
+        return {"deviation_sd": torch.where(strange <= 0, self.own.sd_of(weight, features), self.own.fallback_sd)}
 
     def choose(
         self,
@@ -369,18 +377,26 @@ class Functions:
         good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
         both = zip((correction, excess, weight, features), (first, near, near_weight, near_features), strict=True)
         taken, excess, weight, features = (torch.where(good, *pair) for pair in both)
-        return self.finish(ideal, strange, known * taken, known * taken, excess, weight, features, doubt)
+        found = self.finish(ideal, strange, known, taken, excess, weight, doubt)
+        return found | {"weight": weight, "features": features}
 
     def finish_back(
-        self, ideal: Tensor, strange: Tensor, found: Tensor, excess: Tensor, weight: Tensor, doubt: Tensor
+        self,
+        ideal: Tensor,
+        strange: Tensor,
+        known: Tensor,
+        found: Tensor,
+        excess: Tensor,
+        weight: Tensor,
+        doubt: Tensor,
     ) -> Variables:
-        inside = excess <= 0
+        inside, found = excess <= 0, known * found
         return {
             "ideal": ideal + found,
             "back_deviation": found,
             "ideal_inside_domain": inside.squeeze(-1),
             "back_guard": weight,
-            "ideal_status": status_of(strange, inside, doubt).squeeze(-1),
+            "ideal_status": self.status(strange, inside, doubt).squeeze(-1),
         }
 
     def choose_back(
@@ -395,8 +411,11 @@ class Functions:
         doubt: Tensor,
     ) -> Variables:
         good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
-        deviation = -known * torch.where(good, correction, first)
-        return self.finish_back(ideal, strange, deviation, excess, weight, doubt)
+        return self.finish_back(ideal, strange, known, -torch.where(good, correction, first), excess, weight, doubt)
+
+    def status(self, strange: Tensor, inside: Tensor, doubt: Tensor) -> Tensor:
+        """See `status_of`."""
+        return status_of(strange, inside, doubt)
 
     def _doubt(self, wanted: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
         """Whether a correction is damped, at a bound or on its way, `... x 1`: above 0."""
@@ -455,7 +474,11 @@ class ControllerFunctions(Functions):
         right = ((command + found - q).abs() <= rounding).all(-1, keepdim=True)
         good = right & self.own.is_allowed(found) & (strange <= 0)
         state = status_of(strange, good & (excess <= 0))
-        return {"command": torch.where(good, command, q), "deviation": torch.where(good, found, 0.0), "status": state}
+        return {
+            "command": torch.where(good, command, q),
+            "deviation": torch.where(good, correction, 0.0),
+            "status": state,
+        }
 
     def finish_back(  # type: ignore[override]
         self, q: Tensor, strange: Tensor, found: Tensor, excess: Tensor

@@ -199,9 +199,12 @@ class MaskedNetwork(nn.Module):
             noise = layers[-1].weight.new_ones(outputs)
         else:
             factors = _kept_factors(masks, factors, slots, used, read, unread)
-            # The same sum of squares in as few terms as there are columns; a described network's are zeros, and few.
+            # The same sum of squares in as few terms as the rank; a described network's are zeros, and few.
             if factors.shape[-2] > factors.shape[-1] and bool(factors.any()):
-                factors = torch.linalg.qr(factors, mode="r")[1]
+                _, sizes, axes = torch.linalg.svd(torch.linalg.qr(factors, mode="r")[1])
+                rounding = sizes.shape[-1] * torch.finfo(sizes.dtype).eps * sizes[..., :1]
+                rank = int((sizes > rounding).sum(-1).max())
+                factors = (sizes.unsqueeze(-1) * axes)[..., :rank, :]
         self.register_buffer("factors", factors.flatten(0, 1).contiguous())
         self.register_buffer("noise", noise.clone())
         frequencies = layers[0].weight.new_zeros(int(used.sum()), read + unread)

@@ -330,6 +330,10 @@ def _kept(
     return Table(file, header.units, values[:, header.kept], lines, cells, notes=tuple(notes), start=start)
 
 
+# What a line without cells is made of.
+_BLANK = " \t,;\n"
+
+
 class TextFile:
     """The lines of a file, of which only the bytes are held; `notes` says where its code page had to be guessed."""
 
@@ -353,8 +357,9 @@ class TextFile:
     def filled(self) -> Iterator[tuple[int, str]]:
         """Number and text of each line that has more than separators."""
         for number, line in enumerate(io.TextIOWrapper(io.BytesIO(self._data), encoding=self._code), 1):
-            if line.strip(" \t,;\n"):
-                yield number, line.removesuffix("\n")
+            # Most lines begin with a number.
+            if line[0] not in _BLANK or line.strip(_BLANK):
+                yield number, line[:-1] if line[-1] == "\n" else line
 
 
 def _has_decimal_commas(text: TextFile, header: int, separator: str) -> bool:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import csv_cell, writing_whole
+from ccnn_torch.records.decimals import csv_lines
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import LARGEST, parse_header, si_unit_of, split_header, to_si, write_hint
 
@@ -218,27 +219,32 @@ def writing_table(path: str | Path) -> Iterator[Callable[[Mapping[str, ArrayLike
             twice = [name for name in names if names.count(name) > 1]
             if twice:
                 raise InputError(f"{path}: column '{twice[0]}' would occur twice in the header")
-            texts = [_texts(values) for values in columns.values()]
-            if len(set(map(len, texts))) != 1:
+            cells = [_cells(values) for values in columns.values()]
+            if len(set(map(len, cells))) != 1:
                 raise InputError(f"{path}: the columns to write must be of one length")
-            lines = [",".join(map(_quoted, columns)), *map(",".join, zip(*texts, strict=True))]
-            stream.write("".join(f"{line}\n" for line in lines[1 if stream.tell() else 0 :]).encode())
+            if any(isinstance(values, list) for values in cells):
+                texts = [values if isinstance(values, list) else _numbers(values) for values in cells]
+                lines = "".join(f"{','.join(row)}\n" for row in zip(*texts, strict=True)).encode()
+            else:
+                lines = csv_lines(np.stack(cells, -1))
+            head = ",".join(map(_quoted, columns)) + "\n"
+            stream.write((b"" if stream.tell() else head.encode()) + lines)
 
         yield write
 
 
-def _texts(values: ArrayLike | list[str]) -> list[str]:
+def _cells(values: ArrayLike | list[str]) -> NDArray[np.float64] | list[str]:
     if isinstance(values, list) and any(isinstance(cell, str) for cell in values):
         return [_quoted(csv_cell(str(cell))) for cell in values]
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 1:
         raise InputError("the columns to write must be one-dimensional")
-    return _numbers(array)
+    return array
 
 
 def _numbers(values: NDArray[np.float64]) -> list[str]:
     """Numbers with 17 significant digits; empty where there is none."""
-    return ["" if value != value else f"{value:.17g}" for value in values.tolist()]
+    return csv_lines(values[:, None]).decode().split("\n")[:-1]
 
 
 def _quoted(cell: str) -> str:

@@ -192,7 +192,7 @@ def test_texts_are_repeated_and_run_in_no_spreadsheet(folder: Path, tmp_path: Pa
 class Statuses(LoadedModel):
     """Says of every row how it was found: exact, outside, no number, damped, damped, …"""
 
-    def __call__(self, joints: ArrayLike, covariates: ArrayLike | None = None) -> dict[str, Any]:
+    def __call__(self, joints: ArrayLike, covariates: ArrayLike | None = None, ways: Any = ()) -> dict[str, Any]:
         found = super().__call__(joints, covariates)
         states = np.minimum(np.arange(len(found["command"])), 3)
         return found | {"status": states, "ideal_status": states[::-1]}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ccnn_torch.compensation.compensator import Compensator, Hook
+from ccnn_torch.compensation.compensator import WAYS, Compensator, Hook
 from ccnn_torch.compensation.machine import FARTHEST
 from ccnn_torch.compensation.model_files.metadata import (
     RUN_ERRORS,
@@ -151,7 +151,9 @@ def as_rows(
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, promise: Promise) -> dict[str, Array]:
+def kept(
+    found: Mapping[str, Any], joints: Array, covariates: Array | None, promise: Promise, ways: Collection[str] = WAYS
+) -> dict[str, Array]:
     """The outputs, with what breaks the promise replaced by the safe fallback.
 
     A row falls back where an output is missing, of another shape or kind, or not finite, where |deviation| or
@@ -162,9 +164,10 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
     Args:
         joints: `s x n` [SI], anything.
         covariates: `s x m` [SI], anything; None without any.
+        ways: what was asked for.
 
     Returns:
-        `command`, `deviation`, `ideal` and `deviation_sd`, `s x n` [SI], all finite;
+        What was asked for of `command`, `deviation`, `ideal` and `deviation_sd`, `s x n` [SI], all finite;
         `inside_domain`, `ideal_inside_domain` and `fallback`, `s`, bool; `status` and `ideal_status`, `s`, int64: 0
         exact, 1 outside what was measured or fallen back, 2 an input is not finite, 3 damped.
     """
@@ -173,29 +176,29 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
     inputs, strange = promise.cleaned(inputs)
     given = inputs[:, :n]
 
-    floats, bools = ["command", "deviation", "ideal", "deviation_sd"], ["inside_domain", "ideal_inside_domain"]
     safe = {"command": given, "deviation": np.zeros_like(given), "ideal": given}
     safe["deviation_sd"] = np.broadcast_to(promise.sd, given.shape)
+    floats = [name for way in ways for name in _NUMBERS[way]]
+    flags_of = {way: names for way, names in _FLAGS.items() if way in ways}
     # Where an output is no such numbers there are none.
     there = {name: _of_kind(found.get(name), (rows, n), np.float64) for name in floats}
-    flags = {name: _of_kind(found.get(name), (rows,), np.bool_) for name in bools}
-    states = {name: _of_kind(found.get(name), (rows,), np.int64) for name in ("status", "ideal_status")}
+    flags = {name: _of_kind(found.get(name), (rows,), np.bool_) for name, _ in flags_of.values()}
+    states = {name: _of_kind(found.get(name), (rows,), np.int64) for _, name in flags_of.values()}
     whole = all(value is not None for value in (*there.values(), *flags.values(), *states.values()))
-    numbers = {name: safe[name] if value is None else value for name, value in there.items()}
+    numbers = safe | {name: value for name, value in there.items() if value is not None}
 
-    command, deviation, ideal = (numbers[name] for name in floats[:3])
+    command, deviation, ideal, sd = numbers.values()
     rounding = _SLACK * promise.limit + 8 * np.spacing(np.abs(given) + np.abs(deviation))
     # Written so that a NaN is not good.
     good = np.isfinite(command) & np.isfinite(ideal) & (np.abs(deviation) <= promise.limit * (1 + _EDGE))
     good &= (np.abs(command + deviation - given) <= rounding) & (np.abs(ideal - given) <= promise.limit + rounding)
-    good &= (numbers["deviation_sd"] >= 0) & (numbers["deviation_sd"] < np.inf)
+    good &= (sd >= 0) & (sd < np.inf)
     kept_rows: Array = np.logical_and(good.all(-1), whole)
 
     checked = {name: np.where(kept_rows[:, None], numbers[name], safe[name]) for name in floats}
     known = kept_rows & ~strange.any(-1)
-    inside_of = {"inside_domain": ("status", checked["command"]), "ideal_inside_domain": ("ideal_status", given)}
-    for name, (state, at) in inside_of.items():
-        flag = flags[name]
+    for way, (name, state) in flags_of.items():
+        at, flag = checked["command"] if way == "command" else given, flags[name]
         if flag is None:
             flag = np.zeros(rows, dtype=bool)
         checked[name] = known & flag & promise.inside(np.concatenate([at, inputs[:, n:]], -1))
@@ -204,6 +207,11 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
         lost = strange.any(-1) | (states[state] == 2 if states[state] is not None else False)
         checked[state] = np.where(lost, 2, of_row)
     return checked | {"fallback": ~kept_rows}
+
+
+# Outputs of each way.
+_NUMBERS = {"command": ("command", "deviation"), "back": ("ideal",), "sd": ("deviation_sd",)}
+_FLAGS = {"command": ("inside_domain", "status"), "back": ("ideal_inside_domain", "ideal_status")}
 
 
 def _of_kind(value: Any, shape: tuple[int, ...], kind: type) -> Array | None:
@@ -241,7 +249,9 @@ class LoadedModel:
     machine: FoundMachine | None
     signed: bool
 
-    def __call__(self, joints: ArrayLike, covariates: ArrayLike | None = None) -> dict[str, Array]:
+    def __call__(
+        self, joints: ArrayLike, covariates: ArrayLike | None = None, ways: Collection[str] = WAYS
+    ) -> dict[str, Array]:
         """Commands of ideal joints, and ideal joints were they commands.
 
         Every number is finite for every input. A row in which the file breaks what its card promises, say by a
@@ -251,10 +261,11 @@ class LoadedModel:
         Args:
             joints: `... x n` [SI].
             covariates: `... x m` [SI] in the order of `covariates`; None where there are none.
+            ways: `command`, `back` and `sd`, or those of them that are wanted: each takes its time.
 
         Returns:
-            `command`, `deviation`, `ideal` and `deviation_sd`, `... x n` [SI]; `inside_domain`, `ideal_inside_domain`
-            and `fallback`, `...`, bool. A machine has no `deviation_sd`: there is no learner.
+            Of these `command`, `deviation`, `ideal` and `deviation_sd`, `... x n` [SI]; `inside_domain`,
+            `ideal_inside_domain` and `fallback`, `...`, bool. A machine has no `deviation_sd`: there is no learner.
 
         Raises:
             InputError: covariates are missing, or a last dimension is wrong.
@@ -264,12 +275,12 @@ class LoadedModel:
         rows, flat, lead = as_rows(joints, covariates, (self.joints, self.covariates))
         promise = self._promise
         try:
-            found = self.run(rows, flat)
+            found = self.run(rows, flat, ways)
         except RUN_ERRORS as reason:
             raise_if_out_of_memory(reason)
             # A graph may take one row and no two.
             found = {}
-        checked = kept(found, rows, flat, promise)
+        checked = kept(found, rows, flat, promise, ways)
         bad = checked["fallback"]
         if bad.any():
             warnings.warn(
@@ -280,16 +291,17 @@ class LoadedModel:
                 stacklevel=2,
             )
         if self.machine is not None:
-            del checked["deviation_sd"]
+            checked.pop("deviation_sd", None)
         return {name: value.reshape((*lead, *value.shape[1:])) for name, value in checked.items()}
 
-    def run(self, joints: Array, covariates: Array | None) -> dict[str, Array]:
+    def run(self, joints: Array, covariates: Array | None, ways: Collection[str] = WAYS) -> dict[str, Array]:
         """What the file itself gives for joints `s x n` and covariates `s x m`; raises what it likes."""
         if self.compensator is None:
             return run_onnx(self.session, joints, covariates)
         given = [torch.tensor(v) for v in (joints, covariates) if v is not None]
         with torch.no_grad():
-            return {name: value.numpy() for name, value in self.compensator.solve(*given)._asdict().items()}
+            found = self.compensator.run(*given, *(None,) * (2 - len(given)), ways)
+            return {name: value.numpy() for name, value in found.items()}
 
     @cached_property
     def compensator(self) -> Compensator | None:

@@ -103,7 +103,7 @@ class Corrections:
             for k in range(0, len(points), ROWS):
                 rows = np.nan_to_num(ideal[k : k + ROWS])
                 given = np.broadcast_to(centre, (len(rows), len(centre))) if len(centre) else None
-                parts.append(self._loaded(rows, given))
+                parts.append(self._loaded(rows, given, ("command",)))
         found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         inside = found["inside_domain"]
         if self._region is not None:

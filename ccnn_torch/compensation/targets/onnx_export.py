@@ -22,7 +22,17 @@ from torch.fx import GraphModule
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
 from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, OUTPUTS, check_graph, open_onnx, run_onnx
-from ccnn_torch.compensation.routines import KEPT, Functions, execute, routines_of
+from ccnn_torch.compensation.routines import (
+    EXACT,
+    KEPT,
+    NOT_FINITE,
+    OUTSIDE,
+    Functions,
+    Variables,
+    execute,
+    routines_of,
+    status_of,
+)
 from ccnn_torch.compensation.targets.golden import Vectors, probe_points
 from ccnn_torch.compensation.targets.lowering import recorded
 from ccnn_torch.compensation.targets.onnx_graph import Graph, Value
@@ -51,7 +61,48 @@ _SOLID = frozenset({"ideal", "correction", "found"})
 
 
 class GraphFunctions(Functions):
-    """Those of a graph, in which every operation costs as much as a matrix product: fewer of them."""
+    """Those of a graph, in which every operation costs as much as a matrix product: fewer of them.
+
+    Of rows that are not finite nothing is asked before the end.
+    """
+
+    def step(self, q: Tensor, x: Tensor, correction: Tensor, aim: Tensor) -> Variables:  # type: ignore[override]
+        blank = torch.zeros_like(q[..., :1])
+        return super().step(q, x, blank, blank + 1, correction, aim)
+
+    def aim_back(self, q: Tensor, x: Tensor) -> Variables:  # type: ignore[override]
+        blank = torch.zeros_like(q[..., :1])
+        return super().aim_back(q, x, blank, blank + 1)
+
+    def finish(
+        self,
+        ideal: Tensor,
+        strange: Tensor,
+        known: Tensor,
+        correction: Tensor,
+        excess: Tensor,
+        weight: Tensor,
+        doubt: Tensor,
+    ) -> Variables:
+        return super().finish(ideal, strange, known, correction, excess + strange, known * weight, doubt)
+
+    def finish_back(
+        self,
+        ideal: Tensor,
+        strange: Tensor,
+        known: Tensor,
+        found: Tensor,
+        excess: Tensor,
+        weight: Tensor,
+        doubt: Tensor,
+    ) -> Variables:
+        return super().finish_back(ideal, strange, known, found, excess + strange, known * weight, doubt)
+
+    def status(self, strange: Tensor, inside: Tensor, doubt: Tensor) -> Tensor:
+        if self.own.machine is not None:
+            return status_of(strange, inside, doubt)
+        # What is not finite is not inside either. Sums cost less than choices.
+        return torch.where(inside, EXACT, OUTSIDE) + torch.where(strange <= 0, EXACT, NOT_FINITE - OUTSIDE)
 
     def excess(self, caged: Tensor) -> Tensor:
         domain = self.own.domain
@@ -83,7 +134,8 @@ def command_graph(
     n, m = len(compensator.joints), len(compensator.covariates)
     rows, functions = rows_apart_from(compensator), GraphFunctions(compensator)
     examples = functions.start(compensator.domain.centre.repeat(rows, 1))
-    routines = routines_of(compensator, KEPT)
+    sd = "deviation_sd" in outputs
+    routines = routines_of(compensator, KEPT, sd, ("sure",) if sd else ())
     with torch.no_grad():
         for routine in routines:
             functions.run(routine.statements, examples)

@@ -62,6 +62,7 @@ class Graph:
         """rows: of the traced example, whose multiples are lengths that grow with the batch."""
         self.rows, self.opset = rows, opset
         self._dtype = np.dtype(dtype)
+        self.kind = helper.np_dtype_to_tensor_dtype(self._dtype)
         self._nodes: list[onnx.NodeProto] = []
         self._constants: dict[object, onnx.TensorProto] = {}
         self._known: dict[object, str] = {}
@@ -71,8 +72,7 @@ class Graph:
 
     def input(self, name: str, width: int, batch: str | int) -> Value:
         """An input `batch x width`."""
-        kind = helper.np_dtype_to_tensor_dtype(self._dtype)
-        self._inputs.append(helper.make_tensor_value_info(name, kind, [batch, width]))
+        self._inputs.append(helper.make_tensor_value_info(name, self.kind, [batch, width]))
         return Value((self.rows, width), name, (self.rows, width))
 
     def constant(self, value: Any) -> str:
@@ -96,7 +96,8 @@ class Graph:
         if key not in self._known:
             self._known[key] = name = f"v{len(self._known)}"
             self._nodes.append(helper.make_node(op, [*inputs], [name], **attributes))
-            if (op in _MOVES and inputs[0] in self._integers) or (op == "Where" and inputs[-1] in self._integers):
+            first = inputs[-1 if op == "Where" else 0]
+            if attributes.get("to") == TensorProto.INT64 or (op in _WHOLE and first in self._integers):
                 self._integers.add(name)
             if op in _TRUTHS or (op in _MOVES and inputs[0] in self._truths):
                 self._truths.add(name)
@@ -163,6 +164,8 @@ class Graph:
         """A value `rows x w` as a linear form; None where it is of another shape."""
         if value.form is not None:
             return value.form
+        if self.is_whole(value) or self.is_truth(value):
+            return None
         if len(value.shape) != 2 or len(value.real) != 2 or value.real[0] != self.rows:
             return None
         width, wide = value.real[1], value.shape[1]
@@ -229,8 +232,8 @@ class Graph:
             if own in fixed or own in renamed:
                 own = self.node("Identity", [own], solid.shape, solid.real, doc_string=key).name
             renamed[own] = key
-            kind = helper.np_dtype_to_tensor_dtype(self._dtype)
-            kind = TensorProto.BOOL if own in self._truths else TensorProto.INT64 if own in self._integers else kind
+            kind = TensorProto.INT64 if own in self._integers else self.kind
+            kind = TensorProto.BOOL if own in self._truths else kind
             found.append(helper.make_tensor_value_info(key, kind, [batch, *solid.shape[1:]]))
         needed, nodes = set(renamed), []
         for node in reversed(self._nodes):
@@ -286,6 +289,7 @@ class Graph:
 
 _TRUTHS = frozenset({"Less", "LessOrEqual", "Greater", "GreaterOrEqual", "Equal", "And", "Or", "Not"})
 _MOVES = frozenset({"Squeeze", "Unsqueeze", "Reshape", "Slice", "Gather", "Expand", "Identity", "Transpose", "Concat"})
+_WHOLE = _MOVES | {"Where", "Add"}
 
 
 def _unit(matrix: Tensor) -> int:
