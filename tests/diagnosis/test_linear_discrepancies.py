@@ -12,8 +12,6 @@ from ccnn_torch.effects import EFFECTS
 @pytest.mark.parametrize(
     ("machine", "cause", "size", "driver"),
     [
-        ("delta", "instrument", 30.0, "workspace"),
-        ("stewart", "frame", 30.0, "workspace"),
         ("tripod", "tool", 30.0, "workspace"),
         ("delta", "joint_gain", 10.0, "joint"),
     ],

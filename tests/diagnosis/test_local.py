@@ -24,9 +24,8 @@ def off(situation: Situation, change: torch.Tensor, seed: int) -> torch.Tensor:
     return pose + NOISE * drawn
 
 
-@pytest.mark.parametrize(("machine", "rows"), [("delta", 60)])
-def test_a_dent_in_a_track_is_no_slow_wave_of_its_gear(machine: str, rows: int) -> None:
-    situation = rows_of(machine, rows, 20)
+def test_a_dent_in_a_track_is_no_slow_wave_of_its_gear() -> None:
+    situation = rows_of("delta", 60, 20)
     q = situation.joints[:, 1]
     change = torch.zeros_like(situation.joints)
     place = (q - q.quantile(0.4)) / (0.12 * (q.max() - q.min()))
@@ -54,9 +53,8 @@ def test_waves_of_several_joints_are_no_other_effect() -> None:
     assert said["outside_library"] and said["driver"].startswith("joint") and not said["effects"]
 
 
-@pytest.mark.parametrize(("machine", "periods"), [("five_bar", 18.7), ("tripod", 11.3)])
-def test_a_quick_sway_follows_the_time_and_is_no_noise(machine: str, periods: float) -> None:
-    situation = rows_of(machine, 150, 20)
+def test_a_quick_sway_follows_the_time_and_is_no_noise() -> None:
+    situation, periods = rows_of("five_bar", 150, 20), 18.7
     time = situation.covariates["time"]
     wave = torch.sin(2 * torch.pi * periods * (time - time.min()) / (time.max() - time.min()))
     way = torch.tensor([1.0 if c.unit == "m" else 0.0 for c in situation.mechanism.pose], dtype=torch.float64)

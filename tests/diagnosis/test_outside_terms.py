@@ -116,7 +116,8 @@ def test_a_load_that_moves_no_joint_is_no_error() -> None:
     rows = rows_of("five_bar", 100, 1)
     moment = torch.randn(100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     more = replace(rows, covariates={**rows.covariates, "load_rx": moment})
-    found = diagnose_rows(more, reached_with(more, [acting(more, "backlash", q1=6e-4)], 3))
+    pose = reached_with(more, [acting(more, "backlash", q1=6e-4)], 3)
+    found = diagnose_rows(more, pose, effects=["backlash", "compliance"])
     assert found.verdict["effects"] == ["backlash"]
     # Its torques on the joints, all 0, are no columns.
     assert all(bool(a.columns.any()) for a in found.analysis.atoms)

@@ -10,7 +10,6 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-import torch
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, situation_of
 from ccnn_torch.diagnosis.checks.identifiable import check_rows
@@ -148,13 +147,6 @@ def test_a_condition_in_another_unit_or_an_empty_one_is_refused(
     with pytest.raises(InputError) as told:
         _diagnosed(path)
     told.match(sentence)
-
-
-def test_the_same_rows_give_the_same_diagnosis(tmp_path: Path) -> None:
-    path = _measured(tmp_path / "r.csv", (0.75, 1.1, 0.5, 4.5e4, 4e4), rows=60)
-    first, again = _diagnosed(path), _diagnosed(path)
-    assert first.to_json() == again.to_json()
-    assert torch.equal(first.analysis.residual, again.analysis.residual)
 
 
 def test_a_simulator_without_parameters_has_effects_of_its_joints(tmp_path: Path) -> None:
