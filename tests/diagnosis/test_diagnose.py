@@ -119,14 +119,14 @@ def test_bad_rows_are_set_aside_and_do_not_hide_the_cause() -> None:
     pose = measured(situation, {"backlash": 10.0}, 10)
     bad = [3, 50, 51, 120, 199]
     pose[bad] += 100 * NOISE
-    said = diagnose_rows(situation, pose)
+    said = diagnose_rows(situation, pose, effects=["joint_offset", "backlash", "friction"])
     assert said.verdict["effects"] == ["backlash"] and not any("lie together" in text for text in said.cautions)
     assert set(said.rows_set_aside) == {*bad, *near_singular(said)}
 
 
 def test_poses_as_the_model_says_to_the_last_digit_have_no_cause() -> None:
     situation = rows_of("five_bar", 60, 21)
-    assert diagnose_rows(situation, situation.pose).verdict["none"]
+    assert diagnose_rows(situation, situation.pose, effects=["geometry", "backlash"]).verdict["none"]
 
 
 def test_one_row_of_a_heavy_tail_is_no_cause_and_one_far_beyond_is() -> None:
