@@ -103,7 +103,7 @@ def arm(tmp_path: Path, tool: str = "unknown") -> SerialArm:
     return machine
 
 
-def path_of(machine: SerialArm, rows: int = 30) -> tuple[torch.Tensor, Array]:
+def path_of(machine: SerialArm, rows: int = 12) -> tuple[torch.Tensor, Array]:
     """Joints of a walk from home, and the flange's poses there."""
     steps = 0.15 * torch.randn(rows, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     joints = machine.home_joints + steps.cumsum(0)
@@ -156,7 +156,7 @@ def test_what_was_commanded_is_refused_by_row(tmp_path: Path) -> None:
         place, "there is no column 'q1'; give the joints (q1[rad] …), or the commanded pose as goal_x[m], goal_y[m]"
     )
     refused(goals | place, "do not determine the 6 joints", "goal_rx, goal_ry, goal_rz")
-    far = goals | turns | {"goal_x[m]": np.where(np.arange(30) == 7, 9.0, pose[:, 0])}
+    far = goals | turns | {"goal_x[m]": np.where(np.arange(12) == 7, 9.0, pose[:, 0])}
     refused(far | place, "no joints for the pose goal_x = 9 m", "line 9 (row 8)")
     lacking = {name: values for name, values in (goals | turns).items() if name != "goal_z[m]"}
     refused(lacking | place, "there is no column 'goal_z'")

@@ -112,7 +112,7 @@ def test_paths_start_from_the_file_or_from_the_current_folder(tmp_path: Path, mo
     assert made.records == str(tmp_path / "here" / "r.csv") and made.mechanism == os.path.expanduser("~/arm.urdf")
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=10)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=5)
 @given(
     name=st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S", "Zs")), min_size=1),
     weight=st.floats(1e-300, 1e300),

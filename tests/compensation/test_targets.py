@@ -66,7 +66,8 @@ def made_kind(kind: str, dtype: str = "float64", sd: bool = True) -> tuple[Compe
     return compensator, *made(compensator, dtype, sd)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+# "tripod with effects", the longest, is an example of tests/fuzz/test_fuzz_targets.py.
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "tripod with effects"])
 def test_every_kind_of_model_gives_its_numbers_in_c(kind: str, tmp_path: Path) -> None:
     _, form, golden = made_kind(kind)
     worst = require_equal(form, golden)
@@ -164,14 +165,20 @@ def test_structured_text_is_parsed_and_gives_the_numbers(arrays: bool, monkeypat
     files = print_structured_text(form, golden)
     assert (" DO" in files["compensator.st"].partition("CCNN_Compensate")[0]) == arrays
     # The parser takes seconds: the test of itself, alike for all models, is read once.
-    blocks = parse_blocks(files["compensator.st"] + files["selftest.st"] * arrays)
+    text = files["compensator.st"] + files["selftest.st"] * arrays
+    if not arrays:
+        # Of the machine the way to the command; the way back is of the same statements, and as long.
+        text = re.sub(r"FUNCTION_BLOCK CCNN_(\w+_back_|Back_|Ideal)\b.*?END_FUNCTION_BLOCK", "", text, flags=re.DOTALL)
+    blocks = parse_blocks(text)
     rows, more = len(golden.joints), {"covariates": golden.covariates.T} if form.covariates else {}
     with np.errstate(all="ignore"):
-        compensate, ideal = (Instance(blocks, name, rows) for name in ("CCNN_Compensate", "CCNN_Ideal"))
+        compensate = Instance(blocks, "CCNN_Compensate", rows)
         compensate(joints=golden.joints.T, **more)
-        ideal(command=golden.joints.T, **more)
         found = {name: compensate.values[name].T for name in ("command", "deviation", "status")}
-        found |= {"ideal": ideal.values["joints"].T, "ideal_status": ideal.values["status"]}
+        if arrays:
+            ideal = Instance(blocks, "CCNN_Ideal", rows)
+            ideal(command=golden.joints.T, **more)
+            found |= {"ideal": ideal.values["joints"].T, "ideal_status": ideal.values["status"]}
         if form.sd:
             spread = Instance(blocks, "CCNN_DeviationSd", rows)
             spread(command=golden.joints.T, **more)
@@ -180,7 +187,7 @@ def test_structured_text_is_parsed_and_gives_the_numbers(arrays: bool, monkeypat
             test = Instance(blocks, "CCNN_SelfTest", 1)
             test()
             assert bool(test.values["passed"][0]) and test.values["failed"][0] == 0
-    assert {k: v for k, v in golden.errors(found).items() if v > 1} == {}
+    assert {k: v for k, v in golden.errors(found, [*found]).items() if v > 1} == {}
     assert "status" in blocks["ccnn_compensate"].declarations[1].items[-1].variables[0].variable.name
 
 

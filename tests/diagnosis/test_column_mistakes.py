@@ -15,7 +15,7 @@ def test_loads_that_are_exchanged_are_named() -> None:
     pose = reached_with(situation, [acting(situation, "compliance", q1=2e-6, q2=3e-6)], 51)
     loads = {"load_x": situation.covariates["load_y"], "load_y": situation.covariates["load_x"]}
     wrong = replace(situation, covariates={**situation.covariates, **loads})
-    found = diagnose_rows(wrong, pose)
+    found = diagnose_rows(wrong, pose, effects=["geometry", "joint_offset", "compliance"])
     assert any(c.startswith("load_x and load_y seem to be swapped") for c in found.cautions)
     assert found.verdict["probability"] <= 0.5
     right = diagnose_rows(situation, pose, effects=["geometry", "joint_offset", "compliance"])
@@ -26,7 +26,8 @@ def test_directions_of_the_row_before_are_named() -> None:
     situation = rows_of("five_bar", 150, 52)
     pose = reached_with(situation, [acting(situation, "backlash", q1=4e-4, q2=3e-4)], 53)
     late = {n: v.roll(1) if n.startswith("direction") else v for n, v in situation.covariates.items()}
-    found = diagnose_rows(replace(situation, covariates=late), pose, noise=torch.full((3,), 1e-5).double())
+    noise = torch.full((3,), 1e-5, dtype=torch.float64)
+    found = diagnose_rows(replace(situation, covariates=late), pose, noise, ["geometry", "joint_offset", "backlash"])
     assert any("direction1 and direction2 seem to be shifted, one row late" in c for c in found.cautions)
 
 

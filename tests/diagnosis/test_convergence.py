@@ -116,7 +116,8 @@ def test_a_fit_is_settled_where_noise_and_machine_are_as_the_linear_model_says()
 
 def test_what_does_not_act_keeps_few_shapes_and_that_of_the_textbook() -> None:
     situation = rows_of("five_bar", 120, 3)
-    said = diagnose_rows(situation, measured(situation, {"joint_gain": 12.0}, 4))
+    effects = ["joint_gain", "backlash", "friction", "drift"]
+    said = diagnose_rows(situation, measured(situation, {"joint_gain": 12.0}, 4), effects=effects)
     assert said.verdict["effects"] == ["joint_gain"]
     shapes: dict[str, list[Atom]] = {}
     for atom in said.analysis.atoms:

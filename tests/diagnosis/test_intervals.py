@@ -10,7 +10,7 @@ from ccnn_torch.effects import Acting, make_effect
 
 _Z95 = 1.96
 # Frequencies of the screws of three slides, as shares of their grids.
-_SCREWS = ((0.11, 0.27, 0.06), (0.24, 0.08, 0.19), (0.07, 0.31, 0.15), (0.29, 0.17, 0.02))
+_SCREWS = ((0.11, 0.27, 0.06), (0.24, 0.08, 0.19))
 
 
 def _told(places: tuple[float, ...], seed: int) -> tuple[dict[str, dict[str, float]], dict[str, float]]:
@@ -46,6 +46,6 @@ def test_they_hold_the_true_numbers_as_often_as_they_say() -> None:
             assert abs(frequency["value"] / true[f"{joint} frequency"] - 1) < 0.01
             assert 0 < frequency["sd"] < 0.01 * frequency["value"] and frequency["searched"]
             wider = max(wider, told[f"{joint} sin"]["sd"] / told[f"{joint} sin 3"]["sd"])
-    assert inside >= 0.8 * count > 40
+    assert inside >= 0.8 * count > 20
     # Phase and period go together: what is known of a wave's phase is less than of a harmonic that is not there.
     assert wider > 2

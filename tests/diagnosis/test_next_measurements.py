@@ -27,6 +27,16 @@ CAUSE = {"L1": 5e-4}
 CANDIDATES = ["geometry", "joint_offset", "joint_gain", "gravity", "frame", "instrument"]
 
 
+Confused = tuple[Situation, Diagnosis]
+
+
+@pytest.fixture(scope="module")
+def confused() -> Confused:
+    """Rows in which the cause looks like others, and what is found in them."""
+    rows = cramped("five_bar", 60, 0)
+    return rows, diagnose_rows(rows, reached_with(rows, [acting(rows, "geometry", **CAUSE)], 5), EXACT, CANDIDATES)
+
+
 def _more(rows: Situation, joints: Tensor, covariates: Mapping[str, Tensor]) -> Situation:
     """Rows measured after the others, a minute each."""
     late = rows.covariates["time"][-1] + 60 * torch.arange(1, len(joints) + 1, dtype=torch.float64)
@@ -50,9 +60,8 @@ def _belief(rows: Situation, joints: Tensor, covariates: Mapping[str, Tensor], s
     return said.judgement.marginal["geometry"]
 
 
-def test_rows_proposed_tell_two_confusable_causes_apart_and_better_than_rows_at_random() -> None:
-    rows = cramped("five_bar", 60, 0)
-    said = diagnose_rows(rows, reached_with(rows, [acting(rows, "geometry", **CAUSE)], 5), EXACT, CANDIDATES)
+def test_rows_proposed_tell_two_confusable_causes_apart_and_better_than_rows_at_random(confused: Confused) -> None:
+    rows, said = confused
     assert said.next_measurements[0]["separates"]
     anywhere, near = rows_of("five_bar", 8, 9), cramped("five_bar", 8, 9)
     places = (_proposed(said), (anywhere.joints, anywhere.covariates), (near.joints, near.covariates))
@@ -61,9 +70,8 @@ def test_rows_proposed_tell_two_confusable_causes_apart_and_better_than_rows_at_
     assert proposed < 0.5 * elsewhere < elsewhere < close_by and close_by > 0.3
 
 
-def test_chosen_rows_say_more_together_than_any_drawn_at_random_would() -> None:
-    rows = cramped("five_bar", 60, 0)
-    said = diagnose_rows(rows, reached_with(rows, [acting(rows, "geometry", **CAUSE)], 5), EXACT, CANDIDATES)
+def test_chosen_rows_say_more_together_than_any_drawn_at_random_would(confused: Confused) -> None:
+    _, said = confused
     analysis = said.analysis
     wanted = said.next_measurements
 
@@ -139,9 +147,8 @@ def test_conditions_that_always_came_together_come_apart() -> None:
     assert bool((there.covariates["time"].diff() > 1).all())
 
 
-def test_the_file_is_read_back_as_commands(tmp_path: Path) -> None:
-    rows = cramped("five_bar", 60, 0)
-    said = diagnose_rows(rows, reached_with(rows, [acting(rows, "geometry", **CAUSE)], 5), EXACT, CANDIDATES)
+def test_the_file_is_read_back_as_commands(confused: Confused, tmp_path: Path) -> None:
+    rows, said = confused
     joints = rows.mechanism.joints
     units = covariate_units(rows.mechanism) | {j.name: j.unit for j in joints}
     write_next_csv(tmp_path / "next.csv", said.to_json(), About(units=units))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -46,13 +47,13 @@ def moved(
     fast = np.gradient(asked, time)
 
     def rate(t: float, state: Array) -> list[float]:
+        q, v, held = state.tolist()
         u = float(np.interp(t - delay, time, asked))
-        lead = derivative * (float(np.interp(t - delay, time, fast)) - state[1])
-        error = u - state[0] - np.clip(u - state[0], -band, band)
-        motor = np.clip(GAIN * (error + integral * state[2] + lead) - drive * state[1], -limit, limit)
-        torque = motor - (viscous - drive) * state[1] - weight * np.sin(state[0]) - dry * np.tanh(state[1] / 0.002)
-        torque -= teeth * np.sin(84 * state[0])
-        return [float(state[1]), float(torque / INERTIA), float(error)]
+        lead = derivative and derivative * (float(np.interp(t - delay, time, fast)) - v)
+        error = u - q - min(max(u - q, -band), band)
+        motor = min(max(GAIN * (error + integral * held + lead) - drive * v, -limit), limit)
+        torque = motor - (viscous - drive) * v - weight * math.sin(q) - dry * math.tanh(v / 0.002)
+        return [v, (torque - teeth * math.sin(84 * q)) / INERTIA, error]
 
     begin = [asked[0], 0.0, 0.0]
     found = solve_ivp(rate, (time[0], time[-1]), begin, "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)
@@ -66,7 +67,7 @@ def moved_on_a_spring(time: Array, asked: Array, spring: float, damping: float, 
         q, v, x, w = state.tolist()
         pull = spring * (q - x) + damping * (v - w)
         torque = GAIN * (float(np.interp(t, time, asked)) - q) - VISCOUS * v - pull
-        return [v, torque / (INERTIA - LOAD), w, (pull - MASS * 9.80665 * LENGTH * np.sin(x)) / LOAD]
+        return [v, torque / (INERTIA - LOAD), w, (pull - MASS * 9.80665 * LENGTH * math.sin(x)) / LOAD]
 
     begin = [asked[0], 0.0, asked[0], 0.0]
     found = solve_ivp(rate, (time[0], time[-1]), begin, "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)

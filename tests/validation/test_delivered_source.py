@@ -3,8 +3,10 @@
 import ast
 import json
 import math
+from contextlib import chdir
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import ccnn_validation.delivered as package
@@ -27,7 +29,9 @@ from ccnn_validation.delivered.tables import Commands, read_commands
 from ruamel.yaml import YAML
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from ccnn_torch.cli.application import app
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records
 
@@ -327,7 +331,14 @@ def test_a_compiled_function_gets_joints_and_covariates(tmp_path, monkeypatch):
         assert np.array_equal(found[name].status, np.where(given[:, 0] > 0, 3, 1))
 
 
-def test_one_machine_from_start_to_end(tmp_path):
+def test_one_machine_from_start_to_end(tmp_path, monkeypatch):
+    # In this process: one of its own for every command takes seconds to start.
+    def run(words, cwd, **_):
+        with chdir(cwd):
+            done = CliRunner().invoke(app, words[3:])
+        return SimpleNamespace(returncode=done.exit_code, stdout=done.stdout, stderr=done.stderr)
+
+    monkeypatch.setattr("ccnn_validation.delivered.product.subprocess.run", run)
     machine = draw("five_bar", 1)
     row = judged(
         machine,

@@ -46,7 +46,7 @@ from ccnn_torch.diagnosis.search.convergence import (
 from ccnn_torch.effects import Acting, Effect, Situation, measured_channels, pose_residual
 from ccnn_torch.evidence.beam import search
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
-from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of, groups_of
+from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets, grams_of, groups_of
 
 # Share of the rows at which the machine must be linearised about a set; else it is so about the nominal machine.
 _LINEARISED = 0.9
@@ -313,25 +313,35 @@ def _with_shared_noise(state: Analysis) -> Analysis:
     if state.whitening.seen is not None:
         # Rows that lack values have no noise in them that they could share.
         return state
-    atoms, white, keep, dof = state.atoms, state.whitening, state.whitening.keep(), state.dictionary.noise_dof
-    sets = {(), state.best_of_library.members, state.found[0].members}
+    atoms, white, keep = state.atoms, state.whitening, state.whitening.keep()
+    sets = [*{(), state.best_of_library.members, state.found[0].members}]
+    members = sorted({i for s in sets for i in s})
+    columns = [state.residual[..., None], *(atoms[i].columns for i in members)]
+    places = dict(zip(members, groups_of(columns[1:]), strict=True))
+    possible = possible_correlations(state.situation, keep)
 
-    def log_posterior(correlation: Correlation) -> float:
+    def products(correlation: Correlation) -> Grams:
+        first, *own = _whitened(white, state.fitted, correlation, columns)
+        return grams_of(torch.cat([first[..., :0], *own], -1), first[..., 0])
+
+    # Every set under every correlation, side by side.
+    xx, xy, yy = (torch.stack(each) for each in list(zip(*map(products, possible), strict=True))[:3])
+    fits = fit_sets(
+        Grams(*(v.repeat_interleave(len(sets), 0) for v in (xx, xy, yy)), white.count()),
+        [[places[i] for i in s] for s in sets] * len(possible),
+        state.dictionary.noise_dof,
+    )
+    log_prior = fits.log_evidence.new_tensor([sum(atoms[i].log_prior for i in s) for s in sets])
+    likely = (fits.log_evidence.reshape(-1, len(sets)) + log_prior).amax(-1).tolist()
+
+    def log_posterior(number: int) -> float:
         """Of the most probable of the sets."""
+        correlation = possible[number]
         score = correlation.log_determinant(*state.dictionary.y.shape) + (LOG_PRIOR if correlation.value else 0.0)
         # What any size of the frames is as probable for.
-        score -= size_of_fitted(correlation(white(state.fitted)[keep]))
-        best = -math.inf
-        for members in sets:
-            raw = [state.residual[..., None], *(atoms[i].columns for i in members)]
-            target, *columns = _whitened(white, state.fitted, correlation, raw)
-            x = torch.cat([target[..., :0], *columns], -1)
-            grams = grams_of(x, target[..., 0])._replace(values=white.count())
-            fit = fit_sets(grams, [groups_of(columns)], dof)
-            best = max(best, float(fit.log_evidence[0]) + sum(atoms[i].log_prior for i in members))
-        return score + best
+        return score - size_of_fitted(correlation(white(state.fitted)[keep])) + likely[number]
 
-    correlation = max(possible_correlations(state.situation, keep), key=log_posterior)
+    correlation = possible[max(range(len(possible)), key=log_posterior)]
     if not correlation.value:
         return state
     return _searched(state.rows, state.residual, state.fitted, white, atoms, state.about, correlation)
