@@ -52,8 +52,9 @@ def start(
     """Go from measured rows to a verified model, step by step: new, check, diagnose, run, verify.
 
     Before each step it says what comes, and on a terminal asks whether to go on. It trains no model where the diagnosis
-    finds nothing beyond the noise, and judges none that makes held-out rows no better, but with --yes. What is finished is not done again: ccnn start --out DIR goes on
-    where it was stopped. key=value is for ccnn run. Exit codes are those of the commands.
+    finds nothing beyond the noise, and judges none that makes held-out rows no better, but with --yes. What is finished
+    is not done again: ccnn start --out DIR goes on where it was stopped. key=value is for ccnn run. Exit codes are
+    those of the commands.
 
     Examples:
 
