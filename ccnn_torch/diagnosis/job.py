@@ -96,7 +96,8 @@ def run_check(config: DiagnoseConfig) -> Check:
     situation = situation_of(records, mechanism, config.gravity)
     with naming(records):
         found = check_rows(situation, records.pose, noise_of(_noise(config, records), situation), effects)
-    return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside])
+    doubts = [*found.cautions, *([records.doubt] if records.doubt else [])]
+    return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside], cautions=doubts)
 
 
 def _verdict(config: DiagnoseConfig, tell: Callable[..., None]) -> Diagnosis:
