@@ -80,10 +80,9 @@ def fitting_branches(arm: SerialArm, joints: Tensor, measured: Tensor) -> tuple[
     if len(arm.joints) > 6 or arm.grouped or len(poses) > _GOALS or not bool(measured.isfinite().all(-1).any()):
         return joints, ""
     goals = _goals(arm, machine, joints, measured, row)
-    given = torch.zeros(1, len(poses), dtype=torch.long)
-    # Without an error every branch is as good.
-    if goals.joints.shape[1] == 1 or float(goals.left(given)[1]) < _ROUNDING**2 * goals.gaps.numel():
+    if goals is None:
         return joints, ""
+    given = torch.zeros(1, len(poses), dtype=torch.long)
     near = goals.joints[:_REFERENCES][goals.there[:_REFERENCES]]
     far = machine.wrap(goals.joints - near[:, None, None]).norm(dim=-1)
     choices = torch.cat([given, torch.where(goals.there, far, torch.inf).argmin(-1)])
@@ -114,12 +113,14 @@ def fitting_branches(arm: SerialArm, joints: Tensor, measured: Tensor) -> tuple[
     )
 
 
-def _goals(arm: SerialArm, machine: SerialArm, joints: Tensor, measured: Tensor, row: Tensor) -> _Goals:
-    """The commanded poses with all their solutions; row: number of the pose of each row, `s`."""
+def _goals(arm: SerialArm, machine: SerialArm, joints: Tensor, measured: Tensor, row: Tensor) -> _Goals | None:
+    """The commanded poses with all their solutions; None without an error. row: number of the pose of each row, `s`."""
     own = arm if measured.shape[-1] == len(arm.pose) else arm.with_orientation("none")
     good = measured.isfinite().all(-1)
     values = fit_frames(own, joints[good], measured[good]) if own.unknown_frames else own.nominal
     gaps = frame_gap(own.frame(measured[good]), own.forward_frame(joints[good], values), ROTATION_WEIGHT)
+    if float(gaps.square().mean()) < _ROUNDING**2:
+        return None
     first = torch.stack([torch.nonzero(row == k)[0, 0] for k in range(int(row.max()) + 1)])
     found = _solutions(machine, joints[first])
     there = found.isfinite().all(-1)
