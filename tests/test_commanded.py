@@ -67,6 +67,9 @@ def test_a_printer_without_joints_is_identified_and_corrected(
     wanted = places(40, 2)
     for name, option in (("{}", ["--pose"]), ("goal_{}", [])):
         write_table(tmp_path / "wanted.csv", columns(wanted, name))
+        if option:
+            code, _, err = cli("compensate", "found/identified.yaml", "wanted.csv", "commands.csv")
+            assert code == 2 and "add --pose" in err
         code, _, err = cli("compensate", "found/identified.yaml", "wanted.csv", "commands.csv", *option)
         assert code == 0, err
         table = read_table(tmp_path / "commands.csv")
