@@ -67,6 +67,9 @@ def test_a_printer_without_joints_is_identified_and_corrected(
     wanted = places(40, 2)
     for name, option in (("{}", ["--pose"]), ("goal_{}", [])):
         write_table(tmp_path / "wanted.csv", columns(wanted, name))
+        if option:
+            code, _, err = cli("compensate", "found/identified.yaml", "wanted.csv", "commands.csv")
+            assert code == 2 and "add --pose" in err
         code, _, err = cli("compensate", "found/identified.yaml", "wanted.csv", "commands.csv", *option)
         assert code == 0, err
         table = read_table(tmp_path / "commands.csv")
@@ -136,6 +139,29 @@ def test_an_arms_joints_are_those_of_the_previous_rows_branch(tmp_path: Path) ->
     assert (
         float((longer.controlled().forward_kinematics(away)[:, :3] - torch.from_numpy(pose[:, :3])).abs().max()) < 1e-6
     )
+
+
+def test_an_arms_joints_are_those_with_which_its_errors_fit(tmp_path: Path) -> None:
+    machine = arm(tmp_path)
+    generator = torch.Generator().manual_seed(0)
+    low, high = (torch.tensor(q).deg2rad() for q in ([-40.0, 20, -100, -40, 20, -70], [40.0, 60, -60, 40, 60, 70]))
+    joints = low + (high - low) * torch.rand(15, 6, generator=generator, dtype=torch.float64)
+    wrong = machine.nominal.clone()
+    wrong[6:-6] += 3e-4 * torch.randn(len(wrong) - 12, generator=generator, dtype=torch.float64)
+    goal, pose = machine.forward_kinematics(joints).numpy(), machine.forward_kinematics(joints, wrong).numpy()
+    names = ("x[m]", "y[m]", "z[m]", "rx[rad]", "ry[rad]", "rz[rad]")
+    goals = {f"goal_{name}": goal[:, k] for k, name in enumerate(names)}
+    measured = {name: pose[:, k] + 1e-5 * np.random.default_rng(k).normal(size=15) for k, name in enumerate(names)}
+    write_table(tmp_path / "r.csv", goals | measured)
+    # Home is on another branch: rows that follow it are wrong in the joints of shoulder and elbow.
+    near = machine.controlled().commanded_joints(torch.from_numpy(goal))
+    assert float(machine.wrap(near - joints)[:, :3].abs().max(-1).values.min()) > 0.1
+    records = load_records(tmp_path / "r.csv", machine, learns=False)
+    assert float(machine.wrap(records.joints - joints)[:, :3].abs().max()) < 1e-6
+    assert "guess_q1[rad]" in records.doubt and records.doubt in records.notes
+    guesses = {f"guess_q{k + 1}[rad]": joints[:, k].numpy() for k in range(6)}
+    write_table(tmp_path / "g.csv", goals | measured | guesses)
+    assert load_records(tmp_path / "g.csv", machine, learns=False).doubt == ""
 
 
 def test_what_was_commanded_is_refused_by_row(tmp_path: Path) -> None:

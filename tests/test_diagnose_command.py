@@ -266,15 +266,18 @@ def test_the_command_on_the_screen_puts_the_effect_in_a_compensator(
     assert "found/next_measurements.csv" in shown and "where nothing was measured (by block)" in shown
     assert "What is wrong: Backlash of joints 1 and 2: joint" in shown
     correct, run = (shlex.split(line) for line in shown.splitlines() if line.startswith("  ccnn "))
-    assert correct == ["ccnn", "compensate", "found/diagnosis.json", "TARGETS.csv", "COMMANDS.csv"]
+    assert correct == ["ccnn", "compensate", "found/diagnosis.json", "TARGETS.csv", "COMMANDS.csv", "--pose"]
     page = Path("found/report.html").read_text(encoding="utf-8")
     assert "What is wrong" in page and "ccnn compensate found/diagnosis.json" in page
     # Temperature and time act on nothing that was found: targets need not have them.
     machine = json.loads(Path("found/diagnosis.json").read_text(encoding="utf-8"))["machine"]
     assert set(machine["covariates"]) <= {"load_x", "load_y", "direction1", "direction2"}
     table = read_table(Path("my data/rows 1.csv"))
-    keep = {n: table.column(n) for n in ("q1", "q2", *machine["covariates"])}
-    write_table(Path("TARGETS.csv"), {f"{n}[{table.units[n]}]": v for n, v in keep.items()})
+    keep = {f"{n}[{table.units[n]}]": table.column(n) for n in machine["covariates"]}
+    nominal = load_mechanism("five_bar")
+    joints = torch.from_numpy(np.stack([table.column(f"q{k}") for k in (1, 2)], -1))
+    place = nominal.forward_kinematics(joints).numpy()
+    write_table(Path("TARGETS.csv"), {c.header: place[:, k] for k, c in enumerate(nominal.pose)} | keep)
     code, _, told = cli(*correct[1:])
     assert code == 0, told
     # The true machine misses less under these commands.

@@ -41,6 +41,13 @@ def test_one_command_goes_from_a_table_to_a_verified_model(tmp_path: Path, cli: 
     code, shown, said = cli("start", "--out", out, "--new", rows(tmp_path / "n.csv", 1))
     assert code == 0 and shown.count("done before") == 4 and "The promise is kept" in shown, said
     assert (out / "run" / "results.json").stat().st_mtime_ns == before
+    # A model that makes held-out rows no better is not judged on others, unless it is wanted.
+    results = out / "run" / "results.json"
+    content = json.loads(results.read_text())
+    content["pose"]["position"]["after"] = content["pose"]["position"]["before"]
+    results.write_text(json.dumps(content))
+    code, shown, said = cli("start", "--out", out, "--new", tmp_path / "n.csv")
+    assert code == 0 and "no better" in shown and "The promise" not in shown, said
     # Nothing found: no model is trained of noise, unless it is wanted.
     found = out / "diagnosis" / "diagnosis.json"
     content = json.loads(found.read_text())

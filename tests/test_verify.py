@@ -177,7 +177,12 @@ def test_a_machine_in_a_trackers_frame(tmp_path: Path) -> None:
     rows, new = (delta_rows(tmp_path / f"{seed}.csv", seed, moved=True) for seed in (0, 1))
     keys = {"mechanism": DELTA, "keys": {"rod": 0.55}}
     found = calibrate(
-        records=str(rows), mechanism="framed", mechanism_keys=keys, methods=["constant"], geometry="none", effects="none"
+        records=str(rows),
+        mechanism="framed",
+        mechanism_keys=keys,
+        methods=["constant"],
+        geometry="none",
+        effects="none",
     )
     found.save(tmp_path, forms=())
     told = ccnn_torch.verify(tmp_path / "model.safetensors", new)

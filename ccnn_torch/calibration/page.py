@@ -66,6 +66,10 @@ def _answers(results: RunResults, folder: Path | None) -> list[Answer]:
         told.append(Answer("Step by step", f"{', '.join(parts)} (RMS position error on held-out rows)."))
     if folder is not None and results.records is not None:
         path = typed_path(str(folder))
+        if not pays(results):
+            line = f"ccnn diagnose --config {shlex.quote(f'{path}/config.yaml')} --out {shlex.quote(f'{path}_cause')}"
+            says = "leave this model unused, and find what is wrong with its rows or the machine's file:"
+            return [*told, Answer("Next", says, (line,))]
         if results.model is not None and results.model.method is not None:
             line = f"ccnn compensate {shlex.quote(f'{path}/model.safetensors')} TARGETS.csv COMMANDS.csv --pose"
             told.append(Answer("Next", "correct targets by this model.", (line,)))
@@ -134,25 +138,39 @@ def write_tables(folder: Path, results: RunResults) -> None:
     write_whole(folder / "results.md", replace(run_page(results), notes=()).markdown())
 
 
+def pays(results: RunResults) -> bool:
+    """Whether the model leaves less on held-out rows than no correction does, and than its own parts."""
+    position = results.pose.position
+    removed = removed_percent(position.before.rms, position.after.rms)
+    return not worse_text(results) and (removed is None or removed > 0)
+
+
 def worse_text(results: RunResults) -> str:
     """One sentence where the best method's RMS position error on held-out rows is larger than without it; else empty.
 
-    Without it: what identified geometry and known effects leave by themselves where these are a part, else no
-    correction at all.
+    Without it: the best of no correction, identified geometry, and known effects with it.
     """
     position, best, parts = results.pose.position, results.best_method, results.pose.parts
-    without = position[parts[-1]] if parts else position.before
-    alone, after = without.rms.median, position.after.rms.median
+    steps = {"no correction at all": position.before.rms.median}
+    for k, part in enumerate(parts):
+        steps[f"{' + '.join(parts[: k + 1])} alone"] = position[part].rms.median
+    # Of steps as good as each other the last one says more.
+    instead, alone = min(reversed(steps.items()), key=lambda step: step[1] or math.inf)
+    after = position.after.rms.median
     if best is None or not alone or after is None or after <= _WORSE * alone:
         return ""
     left, right, unit = _both(alone, after)
-    instead = " + ".join(parts) + " alone" if parts else "no correction at all"
-    text = f"On held-out rows {best} makes it worse than {instead} ({left} → {right} {unit} RMS position error)"
+    what = " + ".join([*parts, best])
+    if parts and instead.startswith(" + ".join(parts)):
+        what = best
+    text = f"On held-out rows {what} makes it worse than {instead} ({left} → {right} {unit} RMS position error)"
     if parts and position.explained is not None and (position.explained.rms.median or after) <= _WORSE * alone:
         return (
             f"{text}: the model is right, but its file holds commands back near singular poses or at limits; "
             "ccnn identify, then ccnn compensate identified.yaml, commands by the geometry."
         )
+    if "effects" in parts and "effects" not in instead:
+        return f"{text}: effects=none leaves the effects out."
     if best == "constant":
         return f"{text}: what it learned of the training rows does not hold on others."
     return f"{text}: methods=constant leaves the network out, methods=auto chooses by cross-validation."

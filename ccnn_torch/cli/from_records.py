@@ -303,6 +303,8 @@ def _diagnose_since(model: Path, wanted: DiagnoseConfig, details: bool, quiet: b
     say(results.text)
     for told in results.changed:
         say(told.look)
+    if results.next_measurements:
+        say(f"Measure next: {len(results.next_measurements)} poses, {folder / 'next_measurements.csv'}.")
     for table in since_tables(results, loaded.joints):
         if details and table is not None:
             print_table(table, stdout)

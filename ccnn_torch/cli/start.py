@@ -52,8 +52,9 @@ def start(
     """Go from measured rows to a verified model, step by step: new, check, diagnose, run, verify.
 
     Before each step it says what comes, and on a terminal asks whether to go on. It trains no model where the diagnosis
-    finds nothing beyond the noise, but with --yes. What is finished is not done again: ccnn start --out DIR goes on
-    where it was stopped. key=value is for ccnn run. Exit codes are those of the commands.
+    finds nothing beyond the noise, and judges none that makes held-out rows no better, but with --yes. What is finished
+    is not done again: ccnn start --out DIR goes on where it was stopped. key=value is for ccnn run. Exit codes are
+    those of the commands.
 
     Examples:
 
@@ -95,7 +96,9 @@ def start(
         check(config=config, out=str(out), quiet=quiet)
     if due(3, diagnosis / "report.html", "find the cause of the error (ccnn diagnose)"):
         diagnose(config=config, out=str(diagnosis), quiet=quiet)
+    from ccnn_torch.calibration.page import pays
     from ccnn_torch.report.json_files import read_json
+    from ccnn_torch.report.results.run import RunResults
 
     verdict = read_json(diagnosis / "diagnosis.json")["verdict"]
     what = "nothing beyond the noise was found, so a model would learn noise" if verdict["none"] else "train a model"
@@ -104,6 +107,10 @@ def start(
             run(resume=folder, quiet=quiet)
         else:
             run(config, overrides, out=str(folder), quiet=quiet)
+    if not pays(RunResults.model_validate(read_json(folder / "results.json"))) and not yes:
+        say(f"Stopped here: the model makes held-out rows no better. Mend what the diagnosis names, or add rows; {out} "
+            "holds what was done, --yes goes on.")  # fmt: skip
+        return
     if new_rows is None and asks:
         new_rows = typer.prompt("File of rows measured since, which judge the model (empty: later)", default="") or None
     if new_rows is None:

@@ -320,8 +320,10 @@ def _joints(loaded: LoadedModel, table: Table, back: bool, shown: JointMap | Non
 
 
 def _check_joint_columns(loaded: LoadedModel, table: Table) -> None:
-    """Raise `InputError` for a file with more joints than the model; a missing one is reported when it is read."""
+    """Raise `InputError` for a file with more joints than the model, or with poses alone."""
     known = {c.name for c in loaded.joints}
+    if not known & {*table.names} and {"x", "y"} & {*table.names}:
+        raise InputError(f"{table.path}: has no joints ({loaded.joints[0].header} …) but poses; add --pose")
     other = [name for name in table.names if name[:1] == "q" and name[1:].isdigit() and name not in known]
     if other:
         mechanism = loaded.facts["mechanism"]["name"]

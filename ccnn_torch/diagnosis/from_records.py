@@ -169,7 +169,8 @@ def diagnose(
         )
     mounted = mount_notes(said, mounts, _word(situation))
     notes = [*records.missing, *said.notes, *mounted, *_unread(records, situation, said)]
-    entries = {"notes": notes, "machine": named_machine(said), "frames": frames_taken(said)}
+    doubts = [*said.cautions, *([records.doubt] if records.doubt else [])]
+    entries = {"notes": notes, "cautions": doubts, "machine": named_machine(said), "frames": frames_taken(said)}
     said = replace(said, lines=tuple(records.lines.tolist())).with_entries(**entries)
     return with_network(said, seed) if network else said
 

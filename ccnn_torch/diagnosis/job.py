@@ -96,7 +96,8 @@ def run_check(config: DiagnoseConfig) -> Check:
     situation = situation_of(records, mechanism, config.gravity)
     with naming(records):
         found = check_rows(situation, records.pose, noise_of(_noise(config, records), situation), effects)
-    return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside])
+    doubts = [*found.cautions, *([records.doubt] if records.doubt else [])]
+    return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside], cautions=doubts)
 
 
 def _verdict(config: DiagnoseConfig, tell: Callable[..., None]) -> Diagnosis:
@@ -183,11 +184,11 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
     keys["out"] = f"{typed_path(str(path.parent))}_compensator"
     run = " ".join(["ccnn run", *(shlex.quote(f"{key}={value}") for key, value in keys.items())])
     if diagnosis.machine is None:
-        model = shlex.quote(f"{keys['out']}/model.onnx")
+        model = shlex.quote(f"{keys['out']}/model.safetensors")
         sentence = "No model holds these effects by themselves: these lines learn the gap and correct targets."
-        return sentence, run, f"ccnn compensate {model} TARGETS.csv COMMANDS.csv"
+        return sentence, run, f"ccnn compensate {model} TARGETS.csv COMMANDS.csv --pose"
     sentence = "the first line corrects targets by these effects alone, the second one trains a model of all that pays."
-    return sentence, f"ccnn compensate {shlex.quote(typed_path(str(path)))} TARGETS.csv COMMANDS.csv", run
+    return sentence, f"ccnn compensate {shlex.quote(typed_path(str(path)))} TARGETS.csv COMMANDS.csv --pose", run
 
 
 def _records(config: DiagnoseConfig) -> str:

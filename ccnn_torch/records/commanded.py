@@ -71,6 +71,11 @@ def is_commanded(table: Table, joints: Sequence[Coordinate], ending: str = "") -
     return goals and not any(f"{joint.name}{ending}" in table for joint in joints)
 
 
+def is_open(table: Table, joints: Sequence[Coordinate]) -> bool:
+    """Whether joints are those of commanded poses, and no columns `guess_q1` … say near which."""
+    return is_commanded(table, joints) and not any(f"guess_{joint.name}" in table for joint in joints)
+
+
 def commanded_poses(
     table: Table, mechanism: Moving, ending: str = ""
 ) -> tuple[NDArray[np.float64], str | None, tuple[str, ...]]:
@@ -124,6 +129,7 @@ def _with_commanded(table: Table, mechanism: Moving, ending: str = "") -> Table:
         )
     said = f"the joints are the nominal inverse kinematics of the commanded poses {', '.join(read)}"
     if machine.orientations and not guided:
-        said += "; of several solutions the one nearest to the previous row's, in the first row to the home joints"
+        said += "; of several solutions those with which the rows fit far better, else the one nearest to the previous "
+        said += "row's, in the first row to the home joints"
     found = _with_columns(table, [Coordinate(f"{j.name}{ending}", j.unit) for j in machine.joints], joints.numpy())
     return replace(found, notes=(*table.notes, said))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.records.commanded import Moving, read_joints
+from ccnn_torch.records.commanded import Moving, is_open, read_joints
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES, choose_covariates
 from ccnn_torch.records.headers import (
     HasCoordinates,
@@ -131,6 +131,7 @@ class Records:
         lines: line of each row in the file, `rows`, int64.
         data_hash: SHA-256 of headers and values.
         parts: where rows are from, in order: file and number of its rows; empty for a single file.
+        doubt: a sentence on joints of commanded poses that may be others; empty without.
     """
 
     path: str
@@ -147,6 +148,7 @@ class Records:
     lines: NDArray[np.int64]
     data_hash: str
     parts: tuple[tuple[str, int], ...] = ()
+    doubt: str = ""
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -191,7 +193,8 @@ def load_records(
     """Load records for a mechanism.
 
     Joint and pose columns are named as the mechanism names them. Where there are no joints, they are the nominal
-    inverse kinematics of the poses that were commanded, `goal_x`, `goal_y` … (`commanded.read_joints`). A serial arm
+    inverse kinematics of the poses that were commanded, `goal_x`, `goal_y` … (`commanded.read_joints`), of an arm those
+    of all solutions with which the rows fit best (`SerialArm.fitting_branches`). A serial arm
     (one that lists `orientations`) may have its orientation as a rotation vector `rx, ry, rz`, as a quaternion
     `qw, qx, qy, qz`, as Euler angles (`kuka_a, kuka_b, kuka_c`, `fanuc_w, fanuc_p, fanuc_r`,
     `staubli_rx, staubli_ry, staubli_rz`) or not at all; where a
@@ -215,11 +218,16 @@ def load_records(
     """
     if isinstance(source, Records):
         return _loaded(source, mechanism, covariates, columns or joint_map)
-    table = read_joints(read_source(source, columns), mechanism, joint_map, columns)
+    shown = read_source(source, columns)
+    table = read_joints(shown, mechanism, joint_map, columns)
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
     pose, coordinates, orientation, read = read_pose(table, mechanism, partial=True)
     _refuse_empty(table, pose, coordinates)
     _refuse_without_given(table, mechanism, pose, coordinates)
+    doubt, fitting = "", getattr(mechanism, "fitting_branches", None)
+    if fitting is not None and len(coordinates) in (3, 6) and not joint_map and is_open(shown, mechanism.joints):
+        there, doubt = fitting(torch.from_numpy(joints), torch.from_numpy(pose))
+        joints = there.numpy()
     used = {joint.name for joint in mechanism.joints} | set(read)
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
@@ -243,6 +251,7 @@ def load_records(
         *(f"joint '{name}' is constant and carries no information" for name in still),
         *notes,
         *table.notes,
+        *([doubt] if doubt else []),
     ]
     alike = unused_joints(table, mechanism.joints, unused)
     if alike:
@@ -264,6 +273,7 @@ def load_records(
         lines=table.lines,
         data_hash=table.data_hash,
         parts=table.parts,
+        doubt=doubt,
     )
     return replace(records, notes=[*records.missing, *notes])
 

@@ -443,7 +443,7 @@ def since_text(results: SinceResults) -> str:
     sure = "Changed" if results.probability >= _SURE else "Perhaps changed"
     more = " Beside this more is left than the model promises." if results.rest else ""
     return (
-        f"{sure} since the model was made: {changed} (p {results.probability:.2f}). "
+        f"{sure} since the model was made: {changed} (p {results.probability:.2f}, ± at 95 %). "
         f"On {rows} the {what} is off by {before} RMS, and by {after} with this change, each row left out in turn"
         f"{limit}.{more}"
     )
@@ -455,4 +455,4 @@ def _said(one: Told) -> str:
         return f"{one.text}{instead}"
     number = one.numbers[0]
     scale, unit = display_unit(number.unit, abs(number.value))
-    return f"{one.text} by {number.value / scale:+.3g} ± {number.sd / scale:.2g} {unit}{instead}"
+    return f"{one.text} by {number.value / scale:+.3g} ± {1.96 * number.sd / scale:.2g} {unit}{instead}"

@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ccnn_torch.calibration.callbacks import EventFile, TensorBoardCallback, tags_of
 from ccnn_torch.calibration.figures import write_report
-from ccnn_torch.calibration.page import long_table, result_tables, run_page, verdict, worse_text
+from ccnn_torch.calibration.page import long_table, pays, result_tables, run_page, verdict, worse_text
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import write_json
@@ -101,7 +101,7 @@ def test_a_network_that_makes_it_worse_is_said_with_the_remedy(results: RunResul
     assert worse_text(results) == "" and "makes it worse" not in run_page(results).html()
     assert '<p class="verdict">' in run_page(results).html()
     best = results.best_method
-    for alone, share, said in (("geometry", 0.995, ""), ("geometry", 0.5, "geometry"), ("effects", 0.7, "geometry + ")):
+    for alone, share, said in (("geometry", 0.995, ""), ("geometry", 0.8, "geometry"), ("effects", 0.7, "geometry + ")):
         alike = spread([share * after])
         setattr(position, alone, RmsMax(rms=alike, max=alike))
         told = worse_text(results)
@@ -114,6 +114,14 @@ def test_a_network_that_makes_it_worse_is_said_with_the_remedy(results: RunResul
     screen = io.StringIO()
     run_page(results).show(Console(file=screen, width=500))
     assert told in screen.getvalue()
+    # Nobody is sent to correct by a model that makes it worse, and where the effects do they are left out.
+    folder = Path("runs/r")
+    results.records = results.records or SimpleNamespace()  # type: ignore[assignment]
+    assert not pays(results) and "correct targets by this model" not in run_page(results, (), folder).markdown()
+    assert "leave this model unused" in run_page(results, (), folder).markdown()
+    position.effects = RmsMax(rms=spread([0.9 * after]), max=alike)
+    assert "makes it worse than geometry alone" in worse_text(results) and "effects=none" in worse_text(results)
+    position.effects = RmsMax(rms=alike, max=alike)
     # What the model itself leaves of the rows is no more than what the parts leave: the file's commands are the cause.
     position.explained = RmsMax(rms=alike, max=alike)
     assert "the model is right, but its file holds commands back" in worse_text(results)

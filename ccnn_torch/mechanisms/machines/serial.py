@@ -262,6 +262,12 @@ class SerialArm(Mechanism):
         """See `Mechanism.commanded_joints`; of three joints the positions `s x 3` are enough."""
         return commanded_joints(self if pose.shape[-1] == 6 else self.with_orientation("none"), pose, guess)
 
+    def fitting_branches(self, joints: Tensor, pose: Tensor) -> tuple[Tensor, str]:
+        """Joints of commanded poses on the branch on which the measured poses fit best; see `frames.commanded`."""
+        from ccnn_torch.mechanisms.frames.commanded import fitting_branches
+
+        return fitting_branches(self, joints, pose)
+
     def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:
         """Uniform within the joint limits, `count x n` [SI]."""
         draw = torch.rand(count, len(self.joints), generator=generator, dtype=torch.float64)
