@@ -71,26 +71,6 @@ class Drive(NamedTuple):
     usual: Tensor | None = None
 
 
-def delayed(time: Tensor, values: Tensor, delay: Tensor) -> Tensor:
-    """Values a delay earlier, linear between samples, the first one before the first sample.
-
-    Args:
-        time: `b x s` [s].
-        values: `b x s`.
-        delay: `p x b` [s].
-
-    Returns:
-        `p x b x s`.
-    """
-    p, (b, s) = len(delay), time.shape
-    wanted = (time - delay[..., None]).transpose(0, 1).reshape(b, p * s).contiguous()
-    after = torch.searchsorted(time.contiguous(), wanted).clamp(1, s - 1)
-    t0, t1 = time.gather(1, after - 1), time.gather(1, after)
-    x0, x1 = values.gather(1, after - 1), values.gather(1, after)
-    share = ((wanted - t0) / (t1 - t0)).clamp(0, 1)
-    return (x0 + (x1 - x0) * share).reshape(b, p, s).transpose(0, 1)
-
-
 def simulate_axes(
     drive: Drive, parameters: Mapping[str, Tensor], fast: bool | None = None, rows: Tensor | None = None
 ) -> Tensor:
@@ -138,12 +118,11 @@ def simulate_axes(
             given.reshape(-1, len(ABSENT)), own, run, time, command, start, bent, push, supply, warm, parts
         )
         return torch.from_numpy(together).reshape(*runs.shape, s)
-    delay, row, at = torch.from_numpy(a.delay[own]), run % len(time), torch.from_numpy(run)
-    late = drive.command[at]
-    if bool((delay != 0).any()):
-        moved = delayed(drive.time[torch.from_numpy(row)], late, delay[None])[0]
-        late = torch.where(delay[:, None] != 0, moved, late)
-    u, step = late.numpy() * (1 + a.ratio[own, None]) + a.offset[own, None], np.diff(time)
+    row = run % len(time)
+    late = np.stack(
+        [np.interp(time[k] - d, time[k], command[j]) for k, j, d in zip(row, run, a.delay[own], strict=True)]
+    )
+    u, step = late * (1 + a.ratio[own, None]) + a.offset[own, None], np.diff(time)
     found, axis = np.empty((len(run), s)), axis_of(a)
     for many in np.unique(parts):
         here = np.flatnonzero(parts == many)

@@ -55,7 +55,7 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
         if len(rows) < _FEWEST:
             raise InputError(f"{name}: {len(rows)} rows are no motion; give at least {_FEWEST}")
         here = _of_rows(around, rows)
-        own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], None, here, found.errors)
+        own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], here, found.errors)
         _refuse_absurd(model, name, found, wanted[rows], own.plain)
         command[rows], position[rows], plain[rows] = own.command, own.position, own.plain
     # What the model leaves stays, and adds to what the correction does.

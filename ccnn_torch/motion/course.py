@@ -5,8 +5,6 @@ Every row of an array is a number where the axes go one after the other, compile
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -163,21 +161,6 @@ def _hung(axis: Axis, step: Array, q: Array, push: Array) -> Array:
     return found
 
 
-@compilable
-def _late(time: Array, values: Array, delay: Any) -> Array:
-    """Values a delay earlier, linear between samples, the first one before the first sample."""
-    found, after = np.empty_like(values), 1
-    for k in range(len(time)):
-        wanted = time[k] - delay
-        while after < len(time) - 1 and time[after] < wanted:
-            after += 1
-        while after > 1 and time[after - 1] >= wanted:
-            after -= 1
-        share = (wanted - time[after - 1]) / (time[after] - time[after - 1])
-        found[k] = values[after - 1] + (values[after] - values[after - 1]) * min(max(share, 0.0), 1.0)
-    return found
-
-
 _PARAMETERS = len(Given._fields)
 
 
@@ -212,7 +195,7 @@ def courses(
         b, parameters = run[j], Given(*fixed_tuple(given[own[j]], _PARAMETERS))
         axis = axis_of(parameters)
         times = time[b % len(time)]
-        u = _late(times, command[b], axis.delay) if axis.delay != 0 else command[b].copy()
+        u = np.interp(times - axis.delay, times, command[b]) if axis.delay != 0 else command[b].copy()
         u *= 1 + parameters.ratio
         u += parameters.offset
         pushed, volts, heat = push[b % len(push)], supply[b % len(supply)], warm[b % len(warm)]

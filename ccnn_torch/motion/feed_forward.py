@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ccnn_torch.motion.axis import Drive, delayed, simulate_axes
+from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.mistakes import lag_of
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.stage import ABSENT
@@ -118,7 +118,11 @@ def moved(
             for name in {"delay"}.union(*own)
         }
         # Weights and the other joints are as late as the motion is.
-        late = None if against is None else delayed(drive.time, against, values["delay"])[0]
+        late = None
+        if against is not None:
+            begins = (clock[None] - values["delay"].mT).numpy()
+            pairs = zip(begins, against.numpy(), strict=True)
+            late = torch.from_numpy(np.stack([np.interp(t, clock.numpy(), row) for t, row in pairs]))
         return simulate_axes(drive._replace(torque=late), values)[0]
 
     found = simulate(axes)
@@ -132,7 +136,6 @@ def corrected_command(
     axes: Sequence[Mapping[str, float]],
     time: Array,
     wanted: Array,
-    bound: Sequence[float] | None = None,
     around: Around = AS_USUAL,
     errors: Sequence[float] | None = None,
 ) -> Corrected:
@@ -142,8 +145,6 @@ def corrected_command(
         nominal, axes: the machine as identified, as of `moved`.
         time: `s` [s], increasing.
         wanted: positions, `s x n` [rad or m].
-        bound: largest difference of a command from the wanted position of each joint [rad or m]; None = three times
-            the largest error that the machine has without correction.
         around: of the motion.
         errors: largest ones in the logs that the machine was identified on [rad or m]; a command leaves the range of
             the wanted motion by no more than that or half of that range, and the largest error without correction.
@@ -155,7 +156,7 @@ def corrected_command(
     plain = moved(nominal, axes, time, wanted[None], around)[0]
     error = wanted - plain
     largest = np.abs(error).max(0)
-    limit = _BOUND * largest if bound is None else np.asarray(bound, dtype=np.float64)
+    limit = _BOUND * largest
     beyond = np.minimum(np.maximum(_BEYOND * np.ptp(wanted, 0), np.inf if errors is None else errors), largest)
     lowest = np.maximum(wanted - limit, wanted.min(0) - beyond)
     highest = np.minimum(wanted + limit, wanted.max(0) + beyond)

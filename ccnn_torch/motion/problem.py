@@ -194,10 +194,6 @@ class Problem:
             # Each model has runs of its own then.
             at = {name: v[which.flatten() % len(v)] for name, v in drive._asdict().items() if v is not None}
             drive = drive._replace(**at | {"torque": torque.flatten(0, 1)})
-            if drive.start.shape[1] == len(START):
-                first = torch.searchsorted(self.data.run, self.data.run)[rows]
-                begun = mass[:, None] * self.carried[axis[:, None], first, 0]
-                drive.start[:, START.index("torque")] += begun.flatten()
             which = torch.arange(which.numel()).reshape(which.shape)
         moved = simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
         for name, value in own.items():

@@ -33,6 +33,8 @@ _FIRST, _SCREENED = 8, 16
 # Sets that are fitted anew under another noise; and to all stretches, with log posteriors within so much.
 _KEPT, _LIKELY, _WITHIN = 6, 16, 30.0
 _LONG, _SHORT, _FEW = 8, 5, 3
+# Ways to begin up to which an effect alone is fitted from each.
+_STARTS = 4
 # Difference quotients, for numbers that begin at 0 [plausible sizes].
 _STEP = 0.1
 
@@ -298,8 +300,12 @@ class _Pool:
         promised = promises(self.problem, self.whitening, pairs, self.nuisance, variances)
         for (i, fit), found in zip(pairs, promised, strict=True):
             if not fit.members:
-                # Alone an effect is tried from wherever its numbers may begin: limits are far from linear.
-                more = [started(self.library, fit.spec, v, i) for _, v in found if not v.held]
+                # Alone an effect is tried from wherever it may begin: limits are far from linear.
+                more = [
+                    started(self.library, fit.spec, v, i)
+                    for _, v in found
+                    if len(self.library.variants[v.effect]) <= _STARTS
+                ]
                 wanted[i] |= {(*spec.members, k): spec for k, spec in enumerate(more)}
             scores: dict[int, tuple[float, Variant]] = {}
             for score, variant in found:

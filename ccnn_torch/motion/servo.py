@@ -53,22 +53,10 @@ KEYS: dict[str, str] = {
 TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos"),)
 """Parameters that are torques, which an axis has over the gain."""
 _SIGNED = ("delay", "offset", "ratio", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
-_SAME = {
-    **{
-        "integral": "integral",
-        "derivative": "derivative",
-        "delay": "delay",
-        "offset": "offset",
-        "ratio": "ratio",
-        "dead_band": "dead_band",
-    },
-    **{"backlash": "play", "backlash_loaded": "play_loaded"},
-    "backlash_friction": "play_friction",
-    **{"load_friction": "load_friction", "stribeck_speed": "stribeck_speed", "cogging_order": "cogging_order"},
-    **{"flexibility": "flexibility", "flexible_damping": "flexible_damping", "thermal": "thermal"},
-    "encoder_at_motor": "encoder_at_motor",
-    "supply_share": "supply",
-}
+_OTHERWISE = {"backlash": "play", "backlash_loaded": "play_loaded", "backlash_friction": "play_friction"}
+# What an axis has as the servo does.
+_SAME = {key: key for key in KEYS if key in ABSENT and key not in (*TORQUES, "gain", "supply")} | _OTHERWISE
+_SAME["supply_share"] = "supply"
 
 # Limits, of which an axis has one over each.
 _INVERSE = {"speed_limit": "slowness", "acceleration_limit": "ramp", "no_load_speed": "fading"}

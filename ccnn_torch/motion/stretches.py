@@ -183,16 +183,15 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
     place = np.full((len(pieces), length), -1, dtype=np.int64)
     beside = {name: np.zeros((len(pieces), length)) for name in sorted(names)}
     for k, (number, rows, lead) in enumerate(pieces):
-        log, m = logs[number], len(rows)
-        step = float(np.median(np.diff(log.time[rows])))
-        time[k, :m], place[k, :m] = log.time[rows], rows
-        time[k, m:] = log.time[rows[-1]] + step * np.arange(1, length - m + 1)
-        judged[k, lead:m] = True
-        slope = smooth_speed(log.time[rows], log.position[rows])
-        for table, values in ((command, log.command[rows]), (position, log.position[rows]), (speed, slope)):
-            table[:, k, :m], table[:, k, m:] = values.T, values[-1][:, None]
+        log, m, every = logs[number], len(rows), np.arange(length)
+        # The last sample again and again, ever later.
+        filled, beyond = np.minimum(every, m - 1), np.maximum(every - m + 1, 0)
+        index, place[k, :m], judged[k, lead:m] = rows[filled], rows, True
+        time[k] = log.time[index] + beyond * np.median(np.diff(log.time[rows]))
+        speed[:, k] = smooth_speed(log.time[rows], log.position[rows])[filled].T
+        command[:, k], position[:, k] = log.command[index].T, log.position[index].T
         for name, column in beside.items():
-            column[k, :m], column[k, m:] = log.beside[name][rows], log.beside[name][rows[-1]]
+            column[k] = log.beside[name][index]
     return Stretches(
         time=torch.from_numpy(time),
         command=torch.from_numpy(command),
@@ -217,20 +216,17 @@ _AROUND = 0.15
 
 def phases_of(data: Stretches) -> Tensor:
     """Phase of each sample of each joint by its measured speed, an index of `PHASES`, `n x b x s`."""
-    found = torch.full(data.speed.shape, PHASES.index("slow"))
-    step = data.time.diff(dim=-1).median()
-    width = 2 * int(_AROUND / step) + 1
-    for i, speed in enumerate(data.speed):
-        most = float(torch.quantile(speed[data.judged].abs()[:100_000], 0.98))
-        moving = speed.abs() > _STILL * most
-        sign = torch.sign(speed) * moving
-        # The last direction in which it moved, so that a stop between two directions is a reversal too.
-        place = torch.arange(sign.shape[-1]).expand(sign.shape)
-        last = sign.gather(-1, torch.where(sign != 0, place, 0).cummax(-1).values)
-        turned = torch.zeros_like(last)
-        turned[..., 1:] = (last[..., 1:] * last[..., :-1] < 0).double()
-        near = torch.nn.functional.max_pool1d(turned[:, None], width, 1, width // 2)[:, 0] > 0
-        found[i][speed.abs() > _FAST * most] = PHASES.index("fast")
-        found[i][near] = PHASES.index("reversal")
-        found[i][~moving & ~near] = PHASES.index("standstill")
+    speed, width = data.speed, 2 * int(_AROUND / data.time.diff(dim=-1).median()) + 1
+    most = torch.quantile(speed[:, data.judged].abs()[:, :100_000], 0.98, dim=-1)[:, None, None]
+    moving = speed.abs() > _STILL * most
+    sign = torch.sign(speed) * moving
+    # The last direction in which it moved, so that a stop between two directions is a reversal too.
+    place = torch.arange(sign.shape[-1]).expand(sign.shape)
+    last = sign.gather(-1, torch.where(sign != 0, place, 0).cummax(-1).values)
+    turned = torch.nn.functional.pad((last[..., 1:] * last[..., :-1] < 0).double(), (1, 0))
+    near = torch.nn.functional.max_pool1d(turned, width, 1, width // 2) > 0
+    found = torch.full(speed.shape, PHASES.index("slow"))
+    found[speed.abs() > _FAST * most] = PHASES.index("fast")
+    found[near] = PHASES.index("reversal")
+    found[~moving & ~near] = PHASES.index("standstill")
     return found

@@ -54,18 +54,15 @@ def fitted_whitening(residual: Tensor, judged: Tensor) -> Whitening:
         # Nothing is left of a joint that never moves.
         if not bool(target[i].any()):
             continue
-        best = math.inf
         gram, along = past[i].mT @ past[i], past[i].mT @ target[i]
-        for order in range(high + 1):
-            a = torch.zeros(high, dtype=residual.dtype)
-            if order:
-                inner = gram[:order, :order]
-                inner = inner + _RIDGE * inner.diagonal().mean() * torch.eye(order, dtype=inner.dtype)
-                a[:order] = torch.linalg.solve(inner, along[:order])
+        costs, tried = [], found.new_zeros(high + 1, high)
+        for order, a in enumerate(tried):
+            inner = gram[:order, :order]
+            inner = inner + _RIDGE * inner.diagonal().sum() / max(order, 1) * torch.eye(order, dtype=inner.dtype)
+            a[:order] = torch.linalg.solve(inner, along[:order])
             left = float((target[i] - past[i] @ a).square().mean())
-            cost = count * math.log(max(left, 1e-300)) + order * math.log(max(count, 2))
-            if cost < best:
-                best, found[i] = cost, a
+            costs.append(count * math.log(max(left, 1e-300)) + order * math.log(max(count, 2)))
+        found[i] = tried[costs.index(min(costs))]
     found = found * _WIDER ** torch.arange(1, high + 1, dtype=found.dtype)
     used = int((found != 0).any(0).sum())
     return Whitening(found[:, :used])
