@@ -198,16 +198,6 @@ class Compensator(nn.Module):
         values = functions.start(self._inputs(joints, covariates))
         return reduce(lambda found, routine: functions.run(routine.statements, found), asked, values)
 
-    def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As `solve`, for deviations and weights instead of joints, which single precision cannot hold.
-
-        Returns:
-            δ at the command `... x n` [SI], its weight `... x 1` [1] (1 inside the domain); δ and weight were the
-            joints given a command.
-        """
-        found = self.run(joints, covariates)
-        return found["deviation"], found["guard"], found["back_deviation"], found["back_guard"]
-
     @property
     def export_tolerance(self) -> float:
         """Share of the limit to which exports agree: 1e-12, or what network, geometry or effects ask for."""

@@ -34,7 +34,7 @@ def test_the_report_folder(report_folder: Path) -> None:
     names = {p.name for p in report_folder.iterdir()}
     assert {"results.csv", "results.md", "report.html", "plots"} <= names
     plots = {p.name for p in (report_folder / "plots").iterdir()}
-    stems = ("pose_error", "workspace", "joint_errors", "network_ccnn", "convergence_ccnn")
+    stems = ("pose_error", "workspace", "joint_errors")
     assert plots == {f"{stem}.svg" for stem in stems}
 
 
