@@ -192,10 +192,13 @@ class Compensator(nn.Module):
         return Solution(*(found[name] for name in Solution._fields))
 
     def run(self, joints: Tensor, covariates: Tensor | None = None, ways: Collection[str] = WAYS) -> Variables:
-        """What is asked for, by name; each of `WAYS` costs its own evaluations. Arguments and errors as `forward`."""
+        """What is asked for, by name; each of `WAYS` costs its own evaluations, and `sd` is that of a `command`.
+
+        Arguments and errors as `forward`.
+        """
         functions, sd = Functions(self), "sd" in ways
         every = routines_of(self, KEPT, sd, ("sure",) if sd else ())
-        asked = [routine for routine, way in zip(every, WAYS, strict=False) if way in ways or (sd and way == "command")]
+        asked = [routine for routine, way in zip(every, WAYS, strict=False) if way in ways]
         values = functions.start(self._inputs(joints, covariates))
         return reduce(lambda found, routine: functions.run(routine.statements, found), asked, values)
 

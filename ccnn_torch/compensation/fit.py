@@ -308,7 +308,7 @@ def _settling(compensator: Compensator, inputs: Tensor) -> tuple[list[float], Te
         shares.append(float((doubt[regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
         # What has settled stays: only the others take another step.
         moving = (values["doubt"] > values["aim"][:, -1:]).squeeze(-1)
-        if shares[-1] == 0 or not bool(moving.any()):
+        if shares[-1] == 0:
             break
         rows, values = rows[moving], {name: value[moving] for name, value in values.items()}
     return shares, correction, doubt
