@@ -40,7 +40,7 @@ def _lines(values: NDArray[np.float64]) -> bytes:
     cells[np.signbit(flat) & (flat == flat), 0] = ord("-")
     cells[:, -1] = ord(",")
     cells[values.shape[1] - 1 :: values.shape[1], -1] = ord("\n")
-    return cells[cells != 0].tobytes()
+    return bytes(cells[cells != 0])
 
 
 def _digits(size: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
