@@ -16,7 +16,7 @@ from test_run import short
 from ccnn_torch.calibration.job import RUN
 from ccnn_torch.calibration.page import long_table, result_tables, run_page
 from ccnn_torch.calibration.statistics import reach_block
-from ccnn_torch.report.arrays import load_history
+from ccnn_torch.report.arrays import load_tensors
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.report.results.run import RunResults
 from ccnn_torch.report.table import fitting_columns
@@ -58,7 +58,7 @@ def results(run: Path) -> RunResults:
 def test_every_methods_folder_has_the_same_tags_for_what_is_compared(run: Path) -> None:
     for method in ("ccnn", "Line"):
         events = EventAccumulator(str(run / "tensorboard" / method), size_guidance={"scalars": 0}).Reload()
-        history = load_history(run / f"history-{method}.safetensors")
+        history = load_tensors(run / f"history-{method}.safetensors")[0]
         tags = events.Tags()["scalars"]
         for tag in ("heldout/mse_all", "error/train", "training/evaluations", "training/seconds"):
             assert tag in tags, (method, tag)
@@ -77,7 +77,7 @@ def test_results_hold_the_schema_and_tell_the_effort(run: Path, results: RunResu
     assert set(reach["methods"]) == {"ccnn", "Line", "constant"} and reach["set_by"] in ("ccnn", "Line")
     # The lowest point of the worse of the two, found again in its curve.
     curves = {
-        name: np.median(load_history(run / f"history-{name}.safetensors")["heldout_mse_all"], axis=1)
+        name: np.median(load_tensors(run / f"history-{name}.safetensors")[0]["heldout_mse_all"], axis=1)
         for name in ("ccnn", "Line")
     }
     assert reach["level"] == max(curve.min() for curve in curves.values())

@@ -232,12 +232,6 @@ class EventFile:
         self._records.write(event.SerializeToString())
 
 
-def genome(learner: Learner, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
-    """Masks `out x in` and weights `out x in [+ 1]` of one repeat's network; empty for a learner without masks."""
-    found = getattr(learner, "genome", None)
-    return ([], []) if found is None else found(repeat)
-
-
 class ProgressBar:
     """One line on stderr: what is trained, steps done, time left, the error so far. Silent off a terminal."""
 

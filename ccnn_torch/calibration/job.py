@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.calibration.calibrate import Calibration, calibrate, makers
-from ccnn_torch.calibration.callbacks import HeldOut, ProgressBar, TensorBoardCallback, genome
+from ccnn_torch.calibration.callbacks import HeldOut, ProgressBar, TensorBoardCallback
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.evaluate import place_and_error
 from ccnn_torch.calibration.fitting import check_storable
@@ -306,7 +306,6 @@ def _arrays(calibration: Calibration) -> RunArrays:
     # Before compensation is before all of it: what geometry and known effects take away is part of the prediction.
     learned = prepared.dataset.deviation[k]
     whole = torch.where(torch.isfinite(prepared.total[k]), prepared.total[k], learned)
-    masks, weights = genome(outcome.fitted.learner, k)
     systematic = outcome.after_systematic
     simulation = prepared.simulation
     return RunArrays(
@@ -324,8 +323,6 @@ def _arrays(calibration: Calibration) -> RunArrays:
         map_place=None if simulation is None else place(simulation.pose[k]),
         map_before=None if simulation is None else _numpy(simulation.pose_errors(prepared.joints)[1].position[k]),
         map_after=None if systematic is None else _numpy(systematic.position[k]),
-        masks=tuple(mask.cpu().numpy() for mask in masks),
-        weights=tuple(_numpy(weight) for weight in weights),
         axes=axes,
         drawn={} if turns else {name: _numpy(value) for name, value in _drawn(calibration, test).items()},
         labels={"method": method, "repeat": str(k), "mechanism": mechanism.name},

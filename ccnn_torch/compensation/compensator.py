@@ -157,15 +157,16 @@ class Compensator(nn.Module):
 
     def learned(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Guarded and limited part that was learned, at *commanded* joints, `... x n` [SI]; as `forward`."""
-        return self._learned(joints, covariates)[0].value
+        learned, known = self._learned(joints, covariates)
+        return known * learned.value
 
     def sd(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Standard deviation of a newly measured δ at *commanded* joints, model and noise, `... x n` [SI].
 
         Finite for every input; arguments and errors as `forward`.
         """
-        learned, strange = self._learned(joints, covariates)
-        return torch.where(strange <= 0, self.sd_of(learned.weight, learned.features), self.fallback_sd)
+        learned, known = self._learned(joints, covariates)
+        return torch.where(known > 0, self.sd_of(learned.weight, learned.features), self.fallback_sd)
 
     def sd_of(self, weight: Tensor, features: Tensor) -> Tensor:
         """`sd` where the guard's weight, `... x 1` [1], and the network's features, `... x i` [1], are known."""
@@ -191,22 +192,15 @@ class Compensator(nn.Module):
         return Solution(*(found[name] for name in Solution._fields))
 
     def run(self, joints: Tensor, covariates: Tensor | None = None, ways: Collection[str] = WAYS) -> Variables:
-        """What is asked for, by name; each of `WAYS` costs its own evaluations. Arguments and errors as `forward`."""
+        """What is asked for, by name; each of `WAYS` costs its own evaluations, and `sd` is that of a `command`.
+
+        Arguments and errors as `forward`.
+        """
         functions, sd = Functions(self), "sd" in ways
         every = routines_of(self, KEPT, sd, ("sure",) if sd else ())
-        asked = [routine for routine, way in zip(every, WAYS, strict=False) if way in ways or (sd and way == "command")]
+        asked = [routine for routine, way in zip(every, WAYS, strict=False) if way in ways]
         values = functions.start(self._inputs(joints, covariates))
         return reduce(lambda found, routine: functions.run(routine.statements, found), asked, values)
-
-    def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As `solve`, for deviations and weights instead of joints, which single precision cannot hold.
-
-        Returns:
-            δ at the command `... x n` [SI], its weight `... x 1` [1] (1 inside the domain); δ and weight were the
-            joints given a command.
-        """
-        found = self.run(joints, covariates)
-        return found["deviation"], found["guard"], found["back_deviation"], found["back_guard"]
 
     @property
     def export_tolerance(self) -> float:
@@ -262,10 +256,10 @@ class Compensator(nn.Module):
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
 
     def _learned(self, joints: Tensor, covariates: Tensor | None) -> tuple[Learned, Tensor]:
-        """What was learned at commanded joints, and how many inputs were not finite, `... x 1`."""
+        """What was learned at commanded joints, and 1 where all inputs were finite, else 0, `... x 1`."""
         functions = Functions(self)
         found = functions.clean(self._inputs(joints, covariates))
-        return functions.learned(found["q"], found["x"], found["strange"], found["known"]), found["strange"]
+        return functions.learned(found["q"], found["x"]), found["known"]
 
     def _inputs(self, joints: Tensor, covariates: Tensor | None) -> Tensor:
         """Joints and covariates side by side, `... x (n + m)` [SI]."""

@@ -300,12 +300,18 @@ def _settling(compensator: Compensator, inputs: Tensor) -> tuple[list[float], Te
     """Share of the regular rows that have not settled after each step, and the last correction with its doubt."""
     (functions, values), shares = _begun(compensator, inputs, _MOST_STEPS), list[float]()
     regular = values["aim"][:, -1] <= 0
+    correction, doubt = values["correction"].clone(), values["doubt"].clone()
+    rows = torch.arange(len(inputs))
     for _ in range(_MOST_STEPS):
         functions.run(next_step(compensator), values)
-        shares.append(float((values["doubt"][regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
+        correction[rows], doubt[rows] = values["correction"], values["doubt"]
+        shares.append(float((doubt[regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
+        # What has settled stays: only the others take another step.
+        moving = (values["doubt"] > values["aim"][:, -1:]).squeeze(-1)
         if shares[-1] == 0:
             break
-    return shares, values["correction"], values["doubt"]
+        rows, values = rows[moving], {name: value[moving] for name, value in values.items()}
+    return shares, correction, doubt
 
 
 def _begun(compensator: Compensator, inputs: Tensor, most: int) -> tuple[Functions, Variables]:

@@ -277,30 +277,29 @@ class Functions:
         """How far beyond the margin, `... x 1` [1]."""
         return self.own.domain.excess(caged)
 
-    def faded(self, raw: Tensor, weight: Tensor, known: Tensor) -> Tensor:
+    def faded(self, raw: Tensor, weight: Tensor) -> Tensor:
         """What a network gives `... x n` [SI], limited, and faded into the safe correction by its weight `... x 1`."""
         own = self.own
         # Two products instead of safe + weight · (limited - safe): each end is then exact.
-        return own.limited(weight * own.limited(raw) + (known - weight) * own.safe)
+        return own.limited(weight * own.limited(raw) + (1 - weight) * own.safe)
 
-    def learned(self, command: Tensor, x: Tensor, strange: Tensor, known: Tensor) -> Learned:
-        """What was learned at a command."""
+    def learned(self, command: Tensor, x: Tensor) -> Learned:
+        """What was learned at a command; of rows that are not finite nothing is asked before the end."""
         own = self.own
         inputs = torch.cat([command, x], -1)
         caged = inputs if self.caged_once else own.domain.cage(inputs)
         features = own.scaling.features(caged)
         raw = own.scaling.restore(own.network(features))
-        excess = self.excess(caged) + strange
+        excess = self.excess(caged)
         fade = torch.relu(1 - excess)
         weight = fade * fade
-        value = self.faded(raw, weight, known)
+        value = self.faded(raw, weight)
         return Learned(value, excess, weight, features, caged)
 
-    def step(self, q: Tensor, x: Tensor, strange: Tensor, known: Tensor, correction: Tensor, aim: Tensor) -> Variables:
+    def step(self, q: Tensor, x: Tensor, correction: Tensor, aim: Tensor) -> Variables:
         own, n = self.own, self.joints
-        learned = self.learned(q - correction, x, strange, known)
-        found, excess, weight, features, caged = learned
-        doubt = torch.zeros_like(strange)
+        found, excess, weight, features, caged = self.learned(q - correction, x)
+        doubt = torch.zeros_like(weight)
         if own.machine is not None:
             wanted = own.machine.next_correction(q - correction + found, own.held(x), q, correction, aim)
             bounded = own.machine.within(q, wanted, own.most)
@@ -323,10 +322,10 @@ class Functions:
         assert self.own.machine is not None
         return {"aim": self.own.machine.aim(q)}
 
-    def aim_back(self, q: Tensor, x: Tensor, strange: Tensor, known: Tensor) -> Variables:
+    def aim_back(self, q: Tensor, x: Tensor) -> Variables:
         own = self.own
         assert own.machine is not None
-        learned = self.learned(q, x, strange, known)
+        learned = self.learned(q, x)
         aim = own.machine.aim_back(q + learned.value, own.held(x))
         return {"aim": aim, "excess": learned.excess, "weight": learned.weight}
 
@@ -347,7 +346,7 @@ class Functions:
         weight: Tensor,
         doubt: Tensor,
     ) -> Variables:
-        inside, correction = excess <= 0, known * correction
+        inside, correction, weight = excess + strange <= 0, known * correction, known * weight
         return {
             "command": ideal - correction,
             "deviation": correction,
@@ -390,7 +389,7 @@ class Functions:
         weight: Tensor,
         doubt: Tensor,
     ) -> Variables:
-        inside, found = excess <= 0, known * found
+        inside, found, weight = excess + strange <= 0, known * found, known * weight
         return {
             "ideal": ideal + found,
             "back_deviation": found,
@@ -449,17 +448,8 @@ class ControllerFunctions(Functions):
     def clean(self, given: Tensor, covariates: Tensor) -> Variables:  # type: ignore[override]
         return super().clean(torch.cat([given, covariates], -1))
 
-    def step(self, q: Tensor, correction: Tensor, aim: Tensor, x: Tensor) -> Variables:  # type: ignore[override]
-        blank = torch.zeros_like(q[..., :1])
-        return super().step(q, x, blank, blank + 1, correction, aim)
-
-    def aim_back(self, q: Tensor, x: Tensor) -> Variables:  # type: ignore[override]
-        blank = torch.zeros_like(q[..., :1])
-        return super().aim_back(q, x, blank, blank + 1)
-
     def spread(self, q: Tensor, x: Tensor, strange: Tensor) -> Variables:
-        blank = torch.zeros_like(strange)
-        learned = self.learned(q, x, blank, blank + 1)
+        learned = self.learned(q, x)
         sd = self.own.sd_of(learned.weight, learned.features)
         good = torch.logical_and(sd >= 0, sd < torch.inf).all(-1, keepdim=True) & (strange <= 0)
         state = status_of(strange, good & (learned.excess <= 0))

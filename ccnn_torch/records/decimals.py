@@ -15,14 +15,13 @@ _FOUR = np.array([f"{k:04d}".encode() for k in range(10_000)]).view(np.uint32)
 # Bytes of a cell, as of -1.2345678901234567e-308: its sign is the first, and the separator the last.
 _WIDTH, _ROW = 32, np.dtype("V32")
 _ZERO, _POINT = 48, 46
-# Numbers at a time.
-_AT_ONCE = 1 << 16
+# Rows at a time.
+_ROWS = 4096
 
 
 def csv_lines(values: NDArray[np.float64]) -> bytes:
     """Lines of a table `rows x columns`, with 17 significant digits; a cell is empty where a number is none."""
-    rows = max(1, _AT_ONCE // max(1, values.shape[1]))
-    return b"".join(_lines(values[k : k + rows]) for k in range(0, len(values), rows))
+    return b"".join(_lines(values[k : k + _ROWS]) for k in range(0, len(values), _ROWS))
 
 
 def _lines(values: NDArray[np.float64]) -> bytes:
@@ -41,7 +40,7 @@ def _lines(values: NDArray[np.float64]) -> bytes:
     cells[np.signbit(flat) & (flat == flat), 0] = ord("-")
     cells[:, -1] = ord(",")
     cells[values.shape[1] - 1 :: values.shape[1], -1] = ord("\n")
-    return cells[cells != 0].tobytes()
+    return bytes(cells[cells != 0])
 
 
 def _digits(size: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:

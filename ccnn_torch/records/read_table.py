@@ -359,7 +359,7 @@ class TextFile:
         for number, line in enumerate(io.TextIOWrapper(io.BytesIO(self._data), encoding=self._code), 1):
             # Most lines begin with a number.
             if line[0] not in _BLANK or line.strip(_BLANK):
-                yield number, line[:-1] if line[-1] == "\n" else line
+                yield number, line.removesuffix("\n")
 
 
 def _has_decimal_commas(text: TextFile, header: int, separator: str) -> bool:

@@ -13,9 +13,7 @@
 | `test` | s, bool | true = held out |
 | `map_place` | g x d | SI; a denser map of the workspace, where the machine is simulated |
 | `map_before`, `map_after` | g | m |
-| `mask_0`, `mask_1` … | out x in, bool | connections of the network, layer by layer |
 | `drawn.place`, `drawn.before` … | | the held-out rows of the machine's picture, see `report.machine` |
-| `weight_0`, `weight_1` … | out x (in + 1) | 1; last column = bias |
 
 Rows are in the order of the records. `history-METHOD.safetensors` holds the training curves: `step` (t, int64), and
 every metric as t x r or t x r x k; among them `seconds` (one repeat's share of the time inside the learner, the one
@@ -62,8 +60,6 @@ class RunArrays:
     map_place: Array | None = None
     map_before: Array | None = None
     map_after: Array | None = None
-    masks: tuple[NDArray[np.bool_], ...] = ()
-    weights: tuple[Array, ...] = ()
     axes: tuple[Coordinate, ...] = (Coordinate("x", "m"), Coordinate("y", "m"), Coordinate("z", "m"))
     """Names and units of the `d` columns of `place`."""
     drawn: dict[str, Array] = field(default_factory=dict)
@@ -104,8 +100,6 @@ def save_arrays(folder: str | Path, arrays: RunArrays) -> Path:
         if isinstance(value, np.ndarray):
             tensors[entry.name] = value
     tensors |= arrays.drawn
-    tensors |= {f"mask_{i}": mask for i, mask in enumerate(arrays.masks)}
-    tensors |= {f"weight_{i}": weight for i, weight in enumerate(arrays.weights)}
     about = {
         "axes": [[axis.name, axis.unit] for axis in arrays.axes],
         "joints": [[joint.name, joint.unit] for joint in arrays.joints],
@@ -124,28 +118,17 @@ def load_arrays(folder: str | Path) -> RunArrays:
     """
     path = Path(folder) / ARRAYS_FILE
     tensors, about = load_tensors(path)
-    layers = range(sum(name.startswith("mask_") for name in tensors))
-    values: dict[str, NDArray[np.generic]] = {
-        name: value for name, value in tensors.items() if not name.startswith(("mask_", "weight_"))
-    }
     known = {entry.name for entry in fields(RunArrays)} - {"drawn"}
     needed = ("commanded", "measured", "predicted", "test", "place", "position_before", "position_after")
-    missing = [name for name in needed if name not in values]
+    missing = [name for name in needed if name not in tensors]
     if missing or not {"axes", "joints"} <= about.keys():
         raise InputError(f"{path} lacks {', '.join(missing) or 'the joint names'}; it is not of a finished run.")
-    try:
-        masks = tuple(tensors[f"mask_{i}"].astype(bool) for i in layers)
-        weights = tuple(tensors[f"weight_{i}"] for i in layers)
-    except KeyError as error:
-        raise InputError(f"{path} lacks the array {error}.") from None
     return RunArrays(
         joints=tuple(Coordinate(str(name), str(unit)) for name, unit in about["joints"]),
         axes=tuple(Coordinate(str(name), str(unit)) for name, unit in about["axes"]),
-        masks=masks,
-        weights=weights,
         drawn={name: value.astype(np.float64) for name, value in tensors.items() if name.startswith("drawn.")},
         labels={str(k): str(v) for k, v in about.get("labels", {}).items()},
-        **{name: value for name, value in values.items() if name in known},  # type: ignore[arg-type]
+        **{name: value for name, value in tensors.items() if name in known},  # type: ignore[arg-type]
     )
 
 
@@ -160,18 +143,6 @@ def save_history(folder: str | Path, method: str, history: Mapping[str, ArrayLik
     path = Path(folder) / f"history-{method}.safetensors"
     save_tensors(path, history)
     return path
-
-
-def load_history(path: str | Path) -> dict[str, NDArray[np.float64]]:
-    """Read the training curves of one method.
-
-    Raises:
-        InputError: the file is not there or is damaged, or has no `step`.
-    """
-    tensors, _ = load_tensors(Path(path))
-    if "step" not in tensors:
-        raise InputError(f"{path} holds no training curves: it lacks the array 'step'.")
-    return {name: value.astype(np.float64) for name, value in tensors.items()}
 
 
 def save_tensors(path: Path, tensors: Mapping[str, ArrayLike], about: Mapping[str, object] | None = None) -> None:

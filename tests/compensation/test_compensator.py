@@ -109,7 +109,7 @@ def test_the_standard_deviation_inside_outside_and_between(tripod: Compensator) 
     network = tripod.network
     assert isinstance(network, Sigmoids)
     inside = 2e-4 * torch.tensor([1.0, 0.5, 2.0], dtype=torch.float64) * network.variance(features).sqrt()
-    weight = tripod.guarded(joints)[3]
+    weight = tripod.run(joints)["back_guard"]
     expected = (weight**2 * inside**2 + (1 - weight) ** 2 * tripod.safe_sd**2).sqrt()
     found = tripod.sd(joints)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)

@@ -88,8 +88,6 @@ def tripod_run(repeats: int = 5) -> tuple[RunResults, RunArrays, dict[str, np.nd
     held[test[0]] = True
     grid_y, grid_z = (g.ravel() for g in np.meshgrid(np.linspace(-0.2, 0.2, 25), np.linspace(0.4, 0.7, 25)))
     smooth = 1e-4 * (1.8 + 0.8 * np.sin(6 * grid_y) + 1.5 * (grid_z - 0.4))
-    masks = tuple(generator.random(s) < 0.6 for s in ((6, 3), (6, 6), (3, 6)))
-    masks[0][2] = False
     arrays = RunArrays(
         joints=joints,
         commanded=np.stack([y, z, phi], axis=1),
@@ -105,8 +103,6 @@ def tripod_run(repeats: int = 5) -> tuple[RunResults, RunArrays, dict[str, np.nd
         map_place=np.stack([np.zeros(625), grid_y, grid_z], axis=1),
         map_before=smooth,
         map_after=smooth * 0.06 * (1 + 0.3 * np.cos(20 * grid_z)),
-        masks=masks,
-        weights=tuple(generator.normal(size=(m.shape[0], m.shape[1] + 1)) for m in masks),
         labels={"method": "ccnn", "repeat": "0", "mechanism": "tripod"},
     )
     steps = np.arange(1, 121)

@@ -10,7 +10,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.arrays import ARRAYS_FILE, RunArrays, load_arrays, load_history, save_arrays, save_history
+from ccnn_torch.report.arrays import ARRAYS_FILE, RunArrays, load_arrays, load_tensors, save_arrays, save_history
 
 
 def test_arrays_come_back(arrays: RunArrays, tmp_path: Path) -> None:
@@ -18,10 +18,7 @@ def test_arrays_come_back(arrays: RunArrays, tmp_path: Path) -> None:
     again = load_arrays(tmp_path)
     for entry in fields(RunArrays):
         wrote, read = getattr(arrays, entry.name), getattr(again, entry.name)
-        if entry.name in ("masks", "weights"):
-            assert len(wrote) == len(read) == 3
-            assert all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(wrote, read, strict=True))
-        elif isinstance(wrote, np.ndarray):
+        if isinstance(wrote, np.ndarray):
             assert np.array_equal(wrote, read) and wrote.dtype == read.dtype
         else:
             assert wrote == read
@@ -36,13 +33,13 @@ def test_equal_arrays_give_equal_bytes(arrays: RunArrays, tmp_path: Path) -> Non
 
 
 def test_optional_arrays_stay_away(arrays: RunArrays, tmp_path: Path) -> None:
-    save_arrays(tmp_path, replace(arrays, noise=None, rotation_before=None, masks=(), weights=()))
+    save_arrays(tmp_path, replace(arrays, noise=None, rotation_before=None))
     again = load_arrays(tmp_path)
-    assert again.noise is None and again.rotation_before is None and again.masks == ()
+    assert again.noise is None and again.rotation_before is None
 
 
 def test_history_comes_back(history: dict[str, np.ndarray], tmp_path: Path) -> None:
-    again = load_history(save_history(tmp_path, "ccnn", history))
+    again, _ = load_tensors(save_history(tmp_path, "ccnn", history))
     assert set(again) == set(history)
     assert all(np.array_equal(again[name], history[name]) for name in history)
 
@@ -57,9 +54,6 @@ def test_bad_files_are_named(arrays: RunArrays, tmp_path: Path) -> None:
     save_file({"commanded": np.zeros((2, 3))}, tmp_path / ARRAYS_FILE)
     with pytest.raises(InputError, match="lacks measured"):
         load_arrays(tmp_path)
-    save_file({"loss": np.zeros(2)}, tmp_path / "history-ccnn.safetensors")
-    with pytest.raises(InputError, match="lacks the array 'step'"):
-        load_history(tmp_path / "history-ccnn.safetensors")
 
 
 def test_shapes_that_do_not_fit_are_refused(arrays: RunArrays) -> None:

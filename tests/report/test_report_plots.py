@@ -9,12 +9,10 @@ from xml.etree import ElementTree
 import matplotlib as mpl
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.colors import LogNorm
 from report_runs import arm_run
 
-from ccnn_torch.calibration.figures import alive_nodes, convergence_plot, network_plot
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays
@@ -37,18 +35,16 @@ def dots(plot: Plot, panel: int, label: str) -> np.ndarray:
     return np.asarray(line.get_ydata())
 
 
-def all_plots(arrays: RunArrays, history: dict[str, np.ndarray]) -> list[Plot | None]:
+def all_plots(arrays: RunArrays) -> list[Plot | None]:
     return [
         joint_error_plot(arrays),
         pose_error_plot(arrays),
         workspace_plot(arrays),
-        convergence_plot(history, "ccnn", floor=1e-10, constant=1.55e-10, unit="m"),
-        network_plot(arrays.masks, arrays.weights, "ccnn", ["q1", "q2", "q3"]),
     ]
 
 
-def test_every_axis_has_a_label_with_a_unit(arrays: RunArrays, history: dict[str, np.ndarray]) -> None:
-    for plot in all_plots(arrays, history):
+def test_every_axis_has_a_label_with_a_unit(arrays: RunArrays) -> None:
+    for plot in all_plots(arrays):
         assert plot is not None and plot.caption.endswith(".")
         for axes in plot.figure.axes:
             assert axes.has_data()
@@ -161,57 +157,6 @@ def test_the_house_style_leaves_matplotlib_alone(arrays: RunArrays) -> None:
     before = dict(mpl.rcParams)
     joint_error_plot(arrays)
     assert dict(mpl.rcParams) == before
-
-
-def test_convergence_draws_the_median_over_repeats(history: dict[str, np.ndarray]) -> None:
-    plot = convergence_plot(history, "ccnn", floor=1e-10, constant=1.55e-10, unit="m")
-    assert plot is not None
-    assert dots(plot, 0, "best") == pytest.approx(np.median(history["fitness_best"], axis=1))
-    held = plot.figure.axes[1]
-    assert held.get_ylabel() == "mse [m²]" and held.get_yscale() == "log"
-    assert set(dots(plot, 1, "noise floor")) == {1e-10} and set(dots(plot, 1, "constant")) == {1.55e-10}
-    assert convergence_plot({"step": history["step"]}, "x") is None
-    assert convergence_plot({name: values[:1] for name, values in history.items()}, "constant") is None
-
-
-def reachable(masks: list[np.ndarray]) -> list[np.ndarray]:
-    """Naive twin of `alive_nodes`: walk every path from every input to every output."""
-    sizes = [masks[0].shape[1], *(m.shape[0] for m in masks)]
-    on_path = [np.zeros(s, dtype=bool) for s in sizes]
-
-    def walk(layer: int, node: int, path: list[int]) -> None:
-        if layer == len(masks):
-            for at, passed in enumerate(path):
-                on_path[at][passed] = True
-            return
-        for target in np.flatnonzero(masks[layer][:, node]):
-            walk(layer + 1, int(target), [*path, int(target)])
-
-    for start in range(sizes[0]):
-        walk(0, start, [start])
-    return on_path
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.floats(0.1, 0.9))
-def test_alive_nodes_lie_on_a_path_from_input_to_output(seed: int, density: float) -> None:
-    generator = np.random.default_rng(seed)
-    masks = [generator.random(shape) < density for shape in ((4, 2), (3, 4), (2, 3))]
-    alive, twin = alive_nodes(masks), reachable(masks)
-    assert alive[0].all() and alive[-1].all()
-    for found, expected in zip(alive[1:-1], twin[1:-1], strict=True):
-        assert np.array_equal(found, expected)
-
-
-def test_the_network_is_drawn_without_its_dead_nodes(arrays: RunArrays) -> None:
-    plot = network_plot(arrays.masks, arrays.weights, "ccnn", ["q1", "q2", "q3"])
-    shown = np.ma.filled(plot.figure.axes[0].collections[0].get_array(), np.nan).reshape(6, 4)
-    assert np.isnan(shown[2]).all()
-    there = arrays.masks[0][0]
-    assert np.isnan(shown[0, :3][~there]).all()
-    assert shown[0, :3][there] == pytest.approx(arrays.weights[0][0, :3][there])
-    count = sum(int(m.sum()) for m in arrays.masks)
-    assert f"{count} of 72" in plot.caption
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def test_the_report_folder(report_folder: Path) -> None:
     names = {p.name for p in report_folder.iterdir()}
     assert {"results.csv", "results.md", "report.html", "plots"} <= names
     plots = {p.name for p in (report_folder / "plots").iterdir()}
-    stems = ("pose_error", "workspace", "joint_errors", "network_ccnn", "convergence_ccnn")
+    stems = ("pose_error", "workspace", "joint_errors")
     assert plots == {f"{stem}.svg" for stem in stems}
 
 
@@ -77,7 +77,7 @@ def test_the_page_is_whole_and_fetches_nothing(report_folder: Path) -> None:
     page.feed(text)
     page.close()
     assert page.open == []
-    assert page.count["svg"] == 5 == page.count["figcaption"] and page.count["table"] == 5
+    assert page.count["svg"] == 3 == page.count["figcaption"] and page.count["table"] == 5
     assert "script" not in page.count and "link" not in page.count
     outside = [a for a in page.addresses if not a.startswith(("#", "data:"))]
     assert set(outside) == {"results.json", "results.csv", "config.yaml"}

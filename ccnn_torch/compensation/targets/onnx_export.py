@@ -28,7 +28,6 @@ from ccnn_torch.compensation.routines import (
     NOT_FINITE,
     OUTSIDE,
     Functions,
-    Variables,
     execute,
     routines_of,
     status_of,
@@ -61,42 +60,7 @@ _SOLID = frozenset({"ideal", "correction", "found"})
 
 
 class GraphFunctions(Functions):
-    """Those of a graph, in which every operation costs as much as a matrix product: fewer of them.
-
-    Of rows that are not finite nothing is asked before the end.
-    """
-
-    def step(self, q: Tensor, x: Tensor, correction: Tensor, aim: Tensor) -> Variables:  # type: ignore[override]
-        blank = torch.zeros_like(q[..., :1])
-        return super().step(q, x, blank, blank + 1, correction, aim)
-
-    def aim_back(self, q: Tensor, x: Tensor) -> Variables:  # type: ignore[override]
-        blank = torch.zeros_like(q[..., :1])
-        return super().aim_back(q, x, blank, blank + 1)
-
-    def finish(
-        self,
-        ideal: Tensor,
-        strange: Tensor,
-        known: Tensor,
-        correction: Tensor,
-        excess: Tensor,
-        weight: Tensor,
-        doubt: Tensor,
-    ) -> Variables:
-        return super().finish(ideal, strange, known, correction, excess + strange, known * weight, doubt)
-
-    def finish_back(
-        self,
-        ideal: Tensor,
-        strange: Tensor,
-        known: Tensor,
-        found: Tensor,
-        excess: Tensor,
-        weight: Tensor,
-        doubt: Tensor,
-    ) -> Variables:
-        return super().finish_back(ideal, strange, known, found, excess + strange, known * weight, doubt)
+    """Those of a graph, in which every operation costs as much as a matrix product: fewer of them."""
 
     def status(self, strange: Tensor, inside: Tensor, doubt: Tensor) -> Tensor:
         if self.own.machine is not None:
@@ -111,12 +75,12 @@ class GraphFunctions(Functions):
         beyond = torch.relu(torch.cat([away - domain.radius, -away - domain.radius], -1) / domain.width.repeat(2))
         return (beyond * beyond) @ domain._ones.repeat(2, 1)
 
-    def faded(self, raw: Tensor, weight: Tensor, known: Tensor) -> Tensor:
+    def faded(self, raw: Tensor, weight: Tensor) -> Tensor:
         limit, safe = self.own.limit, self.own.safe
         # In units of the limit, with a column of ones that becomes the weight: δ is a linear form of one array then.
         unit = torch.where(limit > 0, limit, torch.ones_like(limit))
         both = weight * torch.clamp(torch.cat([raw / unit, torch.ones_like(weight)], -1), -1.0, 1.0)
-        return both[..., : self.joints] * limit - both[..., self.joints :] * safe + known * safe
+        return both[..., : self.joints] * limit - both[..., self.joints :] * safe + safe
 
 
 def command_graph(
@@ -229,7 +193,8 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     content: bytes = model.SerializeToString(deterministic=True)
     session = open_onnx(content)
     with torch.no_grad():
-        expected = compensator.guarded(*(v.double() for v in given))
+        found = compensator.run(given[0].double(), None if covariates is None else given[1].double())
+        expected = [found[name] for name in _OUTPUTS_FLOAT32]
     tolerance = SINGLE_TOLERANCE * compensator.limit.numpy()
     for row in range(len(joints)):
         one = [v[row : row + 1].numpy() for v in given]
