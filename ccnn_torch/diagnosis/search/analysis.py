@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -318,30 +317,20 @@ def _with_shared_noise(state: Analysis) -> Analysis:
     members = sorted({i for s in sets for i in s})
     columns = [state.residual[..., None], *(atoms[i].columns for i in members)]
     places = dict(zip(members, groups_of(columns[1:]), strict=True))
-    possible = possible_correlations(state.situation, keep)
-
-    def products(correlation: Correlation) -> Grams:
+    possible, grams, scores = possible_correlations(state.situation, keep), [], []
+    for correlation in possible:
         first, *own = _whitened(white, state.fitted, correlation, columns)
-        return grams_of(torch.cat([first[..., :0], *own], -1), first[..., 0])
-
-    # Every set under every correlation, side by side.
-    xx, xy, yy = (torch.stack(each) for each in list(zip(*map(products, possible), strict=True))[:3])
-    fits = fit_sets(
-        Grams(*(v.repeat_interleave(len(sets), 0) for v in (xx, xy, yy)), white.count()),
-        [[places[i] for i in s] for s in sets] * len(possible),
-        state.dictionary.noise_dof,
-    )
-    log_prior = fits.log_evidence.new_tensor([sum(atoms[i].log_prior for i in s) for s in sets])
-    likely = (fits.log_evidence.reshape(-1, len(sets)) + log_prior).amax(-1).tolist()
-
-    def log_posterior(number: int) -> float:
-        """Of the most probable of the sets."""
-        correlation = possible[number]
+        grams += [grams_of(torch.cat([first[..., :0], *own], -1), first[..., 0])] * len(sets)
         score = correlation.log_determinant(*state.dictionary.y.shape) + (LOG_PRIOR if correlation.value else 0.0)
         # What any size of the frames is as probable for.
-        return score - size_of_fitted(correlation(white(state.fitted)[keep])) + likely[number]
-
-    correlation = possible[max(range(len(possible)), key=log_posterior)]
+        scores.append(score - size_of_fitted(correlation(white(state.fitted)[keep])))
+    # Every set under every correlation, side by side.
+    xx, xy, yy = (torch.stack(each) for each in zip(*(g[:3] for g in grams), strict=True))
+    every = [[places[i] for i in s] for s in sets] * len(possible)
+    fits = fit_sets(Grams(xx, xy, yy, white.count()), every, state.dictionary.noise_dof)
+    log_prior = fits.log_evidence.new_tensor([sum(atoms[i].log_prior for i in s) for s in sets])
+    likely = (fits.log_evidence.reshape(-1, len(sets)) + log_prior).amax(-1)
+    correlation = possible[int((likely + likely.new_tensor(scores)).argmax())]
     if not correlation.value:
         return state
     return _searched(state.rows, state.residual, state.fitted, white, atoms, state.about, correlation)
