@@ -176,14 +176,7 @@ def test_a_machine_in_a_trackers_frame(tmp_path: Path) -> None:
     """Its base is fitted to the training rows before anything is learned, and is in the model."""
     rows, new = (delta_rows(tmp_path / f"{seed}.csv", seed, moved=True) for seed in (0, 1))
     keys = {"mechanism": DELTA, "keys": {"rod": 0.55}}
-    found = calibrate(
-        records=str(rows),
-        mechanism="framed",
-        mechanism_keys=keys,
-        methods=["constant"],
-        geometry="none",
-        effects="none",
-    )
+    found = calibrate(records=str(rows), mechanism="framed", mechanism_keys=keys, methods=["constant"], **NOTHING)
     found.save(tmp_path, forms=())
     told = ccnn_torch.verify(tmp_path / "model.safetensors", new)
     # A constant is not all that the frame leaves of the offset, and the frame not all of it.

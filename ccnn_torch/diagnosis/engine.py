@@ -185,7 +185,7 @@ def _diagnosis(said: _Judged, is_given: bool, seed: int) -> Diagnosis:
     """is_given: whether the noise was; seed: of folds and resampling."""
     rows, analysis, judgement, made = said.rows, said.analysis, said.judgement, said.made
     # What no column would bring into sight is no reason to record one.
-    unseen = said.lacking | dict.fromkeys(analysis.idle, UNSHOWN)
+    unseen = said.lacking | dict.fromkeys(analysis.rows.idle, UNSHOWN)
     together = made.main(made.together)
     gap, gap_rotation, listed = blocks(made)
     nothing = not judgement.names and not judgement.outside

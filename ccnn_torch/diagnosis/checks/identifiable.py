@@ -80,7 +80,7 @@ def check_rows(
         aside=sorted(why),
         noise=dict(zip(white.names, white.sigma.tolist(), strict=True)),
         covariates=[n for n, v in situation.covariates.items() if float(v.max() - v.min()) > 0],
-        missing=lacking | dict.fromkeys(analysis.idle, UNSHOWN),
+        missing=lacking | dict.fromkeys(analysis.rows.idle, UNSHOWN),
         weak=weak,
         confusable=_confusable(spans),
         condition=float(condition.max()),

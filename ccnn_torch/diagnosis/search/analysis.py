@@ -45,7 +45,7 @@ from ccnn_torch.diagnosis.search.convergence import (
 from ccnn_torch.effects import Acting, Effect, Situation, measured_channels, pose_residual
 from ccnn_torch.evidence.beam import search
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
-from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets, grams_of, groups_of
+from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets, groups_of
 
 # Share of the rows at which the machine must be linearised about a set; else it is so about the nominal machine.
 _LINEARISED = 0.9
@@ -131,11 +131,6 @@ class Analysis:
         return self.rows.near_singular
 
     @property
-    def idle(self) -> tuple[str, ...]:
-        """Effects that change no pose in these rows, and were no candidates."""
-        return self.rows.idle
-
-    @property
     def best_of_library(self) -> FittedSet:
         """The most probable set without a discrepancy term."""
         return next(f for f in self.found if not any(self.atoms[i].is_discrepancy for i in f.members))
@@ -144,12 +139,11 @@ class Analysis:
     def plain(self) -> tuple[Tensor, Tensor]:
         """Columns of the dictionary and what they explain, as they are in the rows, `s x c x P` and `s x c`, whitened:
         with what rows share."""
-        y = self.dictionary.y
         if self.correlation.value:
             columns = [self.residual[..., None], *(self.atoms[i].columns for i in self.dictionary.groups)]
             first, *own = _whitened(self.whitening, self.fitted, INDEPENDENT, columns)
             return torch.cat([first[..., :0], *own], -1), first[..., 0]
-        return self.dictionary.columns, y
+        return self.dictionary.columns, self.dictionary.y
 
     @property
     def noise_is_known(self) -> bool:
@@ -313,34 +307,24 @@ def _with_shared_noise(state: Analysis) -> Analysis:
         # Rows that lack values have no noise in them that they could share.
         return state
     atoms, white, keep = state.atoms, state.whitening, state.whitening.keep()
-    sets = [*{(), state.best_of_library.members, state.found[0].members}]
+    sets = [(), state.best_of_library.members, state.found[0].members]
     members = sorted({i for s in sets for i in s})
     columns = [state.residual[..., None], *(atoms[i].columns for i in members)]
     places = dict(zip(members, groups_of(columns[1:]), strict=True))
-    possible = possible_correlations(state.situation, keep)
-
-    def products(correlation: Correlation) -> Grams:
-        first, *own = _whitened(white, state.fitted, correlation, columns)
-        return grams_of(torch.cat([first[..., :0], *own], -1), first[..., 0])
-
-    # Every set under every correlation, side by side.
-    xx, xy, yy = (torch.stack(each) for each in list(zip(*map(products, possible), strict=True))[:3])
-    fits = fit_sets(
-        Grams(*(v.repeat_interleave(len(sets), 0) for v in (xx, xy, yy)), white.count()),
-        [[places[i] for i in s] for s in sets] * len(possible),
-        state.dictionary.noise_dof,
-    )
-    log_prior = fits.log_evidence.new_tensor([sum(atoms[i].log_prior for i in s) for s in sets])
-    likely = (fits.log_evidence.reshape(-1, len(sets)) + log_prior).amax(-1).tolist()
-
-    def log_posterior(number: int) -> float:
-        """Of the most probable of the sets."""
-        correlation = possible[number]
+    possible, grams, scores = possible_correlations(state.situation, keep), [], []
+    for correlation in possible:
+        flat = torch.cat(_whitened(white, state.fitted, correlation, columns), -1).flatten(0, 1)
+        grams += [flat.mT @ flat] * len(sets)
         score = correlation.log_determinant(*state.dictionary.y.shape) + (LOG_PRIOR if correlation.value else 0.0)
         # What any size of the frames is as probable for.
-        return score - size_of_fitted(correlation(white(state.fitted)[keep])) + likely[number]
-
-    correlation = possible[max(range(len(possible)), key=log_posterior)]
+        scores.append(score - size_of_fitted(correlation(white(state.fitted)[keep])))
+    # Every set under every correlation, side by side.
+    every = torch.stack(grams)
+    known = Grams(every[:, 1:, 1:], every[:, 1:, 0], every[:, 0, 0], white.count())
+    fits = fit_sets(known, [[places[i] for i in s] for s in sets] * len(possible), state.dictionary.noise_dof)
+    log_prior = fits.log_evidence.new_tensor([sum(atoms[i].log_prior for i in s) for s in sets])
+    likely = (fits.log_evidence.reshape(-1, len(sets)) + log_prior).amax(-1)
+    correlation = possible[int((likely + likely.new_tensor(scores)).argmax())]
     if not correlation.value:
         return state
     return _searched(state.rows, state.residual, state.fitted, white, atoms, state.about, correlation)
