@@ -129,6 +129,20 @@ def test_an_arms_controller_names_and_repeated_targets(tmp_path: Path) -> None:
     assert "# FILL IN" in starter_config(once, tmp_path / "once.yaml")[0]
 
 
+def test_joints_as_a_urdf_and_as_drivers_name_them(tmp_path: Path) -> None:
+    chain = "".join(
+        f'<joint name="{name}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/></joint>'
+        for k, name in enumerate(("pan", "lift", "elbow"))
+    )
+    links = "".join(f'<link name="l{k}"/>' for k in range(4))
+    (tmp_path / "r.urdf").write_text(f'<robot name="r">{links}{chain}</robot>')
+    for theirs in (["pan.pos", "lift.pos", "elbow.pos"], ["actual_q_0", "actual_q_1", "actual_q_2"], ["arm_1_joint"]):
+        names = [f"arm_{k}_joint" for k in (1, 2, 3)] if len(theirs) == 1 else theirs
+        path = write(tmp_path / "r.csv", [*names, "speed_q_0", "x", "y", "z"], np.ones((9, 7)))
+        text, _ = starter_config(path, tmp_path / "c.yaml", str(tmp_path / "r.urdf"), "mm,deg")
+        assert all(f'"{name}": "q{k}[deg]"' in text for k, name in enumerate(names, 1)), text
+
+
 def test_tables_without_joints_or_with_strange_text(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="looks like a joint"):
         starter_config(write(tmp_path / "a.csv", ["x[mm]", "y[mm]"], np.zeros((3, 2))), tmp_path / "a.yaml")
