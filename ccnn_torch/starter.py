@@ -310,11 +310,9 @@ def starter_config(
 def command_of(text: str, config: Path) -> str:
     """The command line for a config that `starter_config` wrote."""
     keys = parse_yaml(text, str(config))
-    if isinstance(keys, dict) and "motion" in keys:
-        return f"ccnn diagnose --config {config} --out runs/{config.stem}"
     if isinstance(keys, dict) and "constraint" in keys:
         return f"ccnn identify {config} out=runs/{config.stem}"
-    return f"ccnn run {config}"
+    return f"ccnn diagnose --config {config} --out runs/{config.stem}"
 
 
 def _motion_config(records: Path, out: Path, mechanism: str | None, keys: Mapping[str, Any]) -> tuple[str, bool]:

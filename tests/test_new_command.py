@@ -55,7 +55,7 @@ def test_from_strange_headers_to_a_finished_run(tmp_path: Path, cli: Cli) -> Non
     assert code == 2 and "--units" in err
     code, out, err = cli("new", records, "--units", "mm,deg", "--mechanism", "delta", "--out", config)
     assert code == 0, err
-    assert f"ccnn run {config}" in out
+    assert f"ccnn diagnose --config {config}" in out
     text = config.read_text(encoding="utf-8")
     assert '"Axis_1": "q1[deg]"' in text and '"X": "x[mm]"' in text and "Not used: No" in text
     assert "# mechanism_keys: {base: " in text
