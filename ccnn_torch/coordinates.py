@@ -62,7 +62,7 @@ class Parameter:
         low, high: bounds [SI]; a simulator is never called beyond them. None = no bound.
         cause: name of its error in a diagnosis; the parameters of one cause are one candidate. None =
             ``geometry``, the lengths and angles of the machine as built.
-        sense: which way it counts, where that is not the usual one (``clockwise``).
+        sense: which way it counts, where that is not the usual one (``clockwise``); or what it is, ``zero of joint 3``.
         word, shown: what people call it (``squareness xy``), and the unit that they tell it in (``um/m``); empty where
             its name and an SI unit do. An angle may be told as a slope.
         held: whether it stays at its nominal value unless a config names it free: it is exact, or another one stands

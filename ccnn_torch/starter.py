@@ -17,6 +17,7 @@ from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
+from ccnn_torch.mechanisms.dh_file import urdf_joints
 from ccnn_torch.mechanisms.frames.judge import coupled_count
 from ccnn_torch.mechanisms.registry import REGISTRY
 from ccnn_torch.motion.log import load_logs
@@ -29,6 +30,11 @@ from ccnn_torch.records.table import Table
 from ccnn_torch.units import si_unit_of, to_si
 
 _JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta)0*(\d+)")
+# As drivers write them: actual_q_0, arm_1_joint, left_joint3.
+_OTHER_JOINT = re.compile(
+    r"(?=.*(?:joint|axis|q\d))(?!.*(?:target|goal|com|cmd|desired|soll|guess|speed|vel|torque|effort|cur|temp|dir))"
+    r"(\D*)(\d+)(?:joint|axis|pos|position)*"
+)
 _POSITION = {"x", "y", "z"}
 # Names of conditions in German, French, Italian and Spanish; taken only where unit and values fit, too.
 _TIME = re.compile(r"(mess)?(zeit|time|temps|tempo|tiempo)")
@@ -85,16 +91,28 @@ class Recognised:
         return "m" if name in _POSITION else "1" if name in ("qw", "qx", "qy", "qz") else "rad"
 
 
-def recognise(table: Table) -> Recognised:
-    """Find joints (q1, J1, A1, joint_1, axis1, …) and pose columns by their names, ignoring case."""
-    folded = {name: re.sub(r"[\s_.\-]", "", name).lower() for name in table.names}
+def recognise(table: Table, joints: Sequence[str] = ()) -> Recognised:
+    """Find joints (q1, J1, A1, joint_1, axis1, …) and pose columns by their names, ignoring case.
+
+    joints: what the mechanism's file calls them; a column may say after it that it is a position.
+    """
+    folded = {name: _folded(name) for name in table.names}
     families: dict[str, dict[int, str]] = {}
-    for name, plain in folded.items():
-        match = _JOINT.fullmatch(plain)
-        if match is not None:
-            families.setdefault(match[1], {}).setdefault(int(match[2]), name)
+    for pattern in (_JOINT, _OTHER_JOINT):
+        for name, plain in folded.items() if not families else ():
+            match = pattern.fullmatch(plain)
+            if match is not None:
+                families.setdefault(match[1], {}).setdefault(int(match[2]), name)
+    # Some count from 0.
+    families = {word: {k + (0 in f): n for k, n in f.items()} for word, f in families.items()}
     numbered = [f for f in families.values() if set(f) == set(range(1, len(f) + 1))]
     family = families["q"] if families.get("q") in numbered else max(numbered, key=len, default={})
+    own = [
+        next((n for n, plain in folded.items() if plain in (j, f"{j}pos", f"{j}position")), "")
+        for j in map(_folded, joints)
+    ]
+    if not family and all(own):
+        family = dict(enumerate(own, 1))
     meaning = {family[k]: f"q{k}" for k in sorted(family)}
     wanted = _POSITION | {c.name for name in REGISTRY if name not in _OPEN for c in load_mechanism(name).pose}
     wanted -= {"rx", "ry", "rz"}
@@ -111,6 +129,10 @@ def recognise(table: Table) -> Recognised:
     inputs = _inputs(table, {name: plain for name, plain in folded.items() if name not in meaning}, len(family))
     known = meaning.keys() | inputs.keys()
     return Recognised(meaning, len(family), [name for name in table.names if name not in known], inputs)
+
+
+def _folded(name: str) -> str:
+    return re.sub(r"[\s_.\-]", "", name).lower()
 
 
 def _goals(by_plain: Mapping[str, str], wanted: set[str]) -> dict[str, str]:
@@ -258,7 +280,7 @@ def starter_config(
     table = read_source(records)
     if {"time", "command1", "q1"} <= {*table.names}:
         return _motion_config(records, out, mechanism, {})
-    found = recognise(table)
+    found = recognise(table, urdf_joints(mechanism) if str(mechanism).lower().endswith(".urdf") else ())
     if not (found.joints or found.goals) or not found.pose:
         what = "measured pose (x, y, z …)"
         if not (found.joints or found.goals):
@@ -288,11 +310,9 @@ def starter_config(
 def command_of(text: str, config: Path) -> str:
     """The command line for a config that `starter_config` wrote."""
     keys = parse_yaml(text, str(config))
-    if isinstance(keys, dict) and "motion" in keys:
-        return f"ccnn diagnose --config {config} --out runs/{config.stem}"
     if isinstance(keys, dict) and "constraint" in keys:
         return f"ccnn identify {config} out=runs/{config.stem}"
-    return f"ccnn run {config}"
+    return f"ccnn diagnose --config {config} --out runs/{config.stem}"
 
 
 def _motion_config(records: Path, out: Path, mechanism: str | None, keys: Mapping[str, Any]) -> tuple[str, bool]:

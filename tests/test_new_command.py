@@ -55,7 +55,7 @@ def test_from_strange_headers_to_a_finished_run(tmp_path: Path, cli: Cli) -> Non
     assert code == 2 and "--units" in err
     code, out, err = cli("new", records, "--units", "mm,deg", "--mechanism", "delta", "--out", config)
     assert code == 0, err
-    assert f"ccnn run {config}" in out
+    assert f"ccnn diagnose --config {config}" in out
     text = config.read_text(encoding="utf-8")
     assert '"Axis_1": "q1[deg]"' in text and '"X": "x[mm]"' in text and "Not used: No" in text
     assert "# mechanism_keys: {base: " in text
@@ -127,6 +127,20 @@ def test_an_arms_controller_names_and_repeated_targets(tmp_path: Path) -> None:
     once = write(tmp_path / "once.csv", headers, arm(60))
     assert "kind: random" in starter_config(once, tmp_path / "once.yaml", mechanism=str(ARM))[0]
     assert "# FILL IN" in starter_config(once, tmp_path / "once.yaml")[0]
+
+
+def test_joints_as_a_urdf_and_as_drivers_name_them(tmp_path: Path) -> None:
+    chain = "".join(
+        f'<joint name="{name}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/></joint>'
+        for k, name in enumerate(("pan", "lift", "elbow"))
+    )
+    links = "".join(f'<link name="l{k}"/>' for k in range(4))
+    (tmp_path / "r.urdf").write_text(f'<robot name="r">{links}{chain}</robot>')
+    for theirs in (["pan.pos", "lift.pos", "elbow.pos"], ["actual_q_0", "actual_q_1", "actual_q_2"], ["arm_1_joint"]):
+        names = [f"arm_{k}_joint" for k in (1, 2, 3)] if len(theirs) == 1 else theirs
+        path = write(tmp_path / "r.csv", [*names, "speed_q_0", "x", "y", "z"], np.ones((9, 7)))
+        text, _ = starter_config(path, tmp_path / "c.yaml", str(tmp_path / "r.urdf"), "mm,deg")
+        assert all(f'"{name}": "q{k}[deg]"' in text for k, name in enumerate(names, 1)), text
 
 
 def test_tables_without_joints_or_with_strange_text(tmp_path: Path) -> None:

@@ -211,7 +211,7 @@ def export(
 
     lerobot: calibration.json with the joints' zeros; the one that is there is --current.
 
-    klipper: printer.cfg with radius, rods, angles and endstops of a delta printer; the one that is there is --current.
+    klipper: printer_delta.cfg with radius, rods, angles and endstops of a delta printer; --current: its printer.cfg.
 
     linuxcnc_hal: kinematics.hal, the numbers of genhexkins (hexapods) or genserkins (arms of six turning joints).
 

@@ -271,7 +271,8 @@ def _used(tree: dict[str, Any], model: type[BaseModel], path: Path, note: Note |
     }
     # A split is of every run, and what does not use it holds rows out by itself.
     left = [n for n in sorted(names) if (first := n.partition(".")[0]) in {n, *kept} and first != "split"]
-    if note is not None and left:
+    # A config that a run has written has all of its keys.
+    if note is not None and left and not {*run.model_fields} <= tree.keys():
         are = "is a key of ccnn run and is" if len(left) == 1 else "are keys of ccnn run and are"
         more = f" and {len(left) - _LISTED} more" if len(left) > _LISTED else ""
         note(f"{path}: {', '.join(left[:_LISTED])}{more} {are} not used here.")

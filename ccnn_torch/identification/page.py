@@ -183,7 +183,9 @@ def _answers(results: Block, folder: str | None) -> list[Answer]:
         for section, key, _, write in printer.rows:
             sections.setdefault(section or [*sections][-1], []).append(f"{key} {write}")
         lines = tuple(f"{section} {', '.join(keys)}" for section, keys in sections.items())
-        said.append(Answer("Enter in printer.cfg", printer.note, lines))
+        sure = any(block["identifiable"] for block in _free(results).values())
+        doubt = "They fit the heights, and heights show no scale: DELTA_ANALYZE's distances of a printed object do. "
+        said.append(Answer("Enter in printer.cfg", ("" if sure else doubt) + printer.note, lines))
     if folder is not None and not results["simulated"] and results["methods"][results["method"]]["converged"]:
         line = f"ccnn compensate {shlex.quote(f'{folder}/identified.yaml')} TARGETS.csv COMMANDS.csv --pose"
         said.append(Answer("Next", "correct targets by the identified machine.", (line,)))

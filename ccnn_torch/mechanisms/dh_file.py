@@ -222,6 +222,12 @@ def read_urdf(
     )
 
 
+def urdf_joints(path: str) -> list[str]:
+    """The names of the joints of a URDF's only chain that move, from the base on; raises as `read_urdf`."""
+    chain = _chain(path, read_xml(path, URDF_LIMIT, "give the path of a URDF"), None, None)
+    return [joint.get("name", "?") for joint in chain if joint.get("type") != "fixed"]
+
+
 _Transform = tuple[Tensor, Tensor]
 _IDENTITY: _Transform = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 

@@ -62,6 +62,8 @@ _FRAMES = {"frame": "base", "tool": "tool"}
 _CHANCE = 0.01
 # A change would have been seen from so many standard deviations of its number: odds of about 20 to 1.
 _SEEN = 4.0
+# A number is known from so small a standard deviation, in plausible sizes.
+_KNOWN = 0.3
 # From this probability on a change is told as one: of claims above it 94 of 99 were right (docs/how_to/verify.md).
 _SURE = 0.9
 # Poses that are proposed, of so many drawn; those that say less [nat] are not worth measuring.
@@ -142,6 +144,7 @@ def what_changed(
             "taken off, and what looks like it is not seen in these rows."
         )
     dictionary, sets = search(atoms, x, y, rows.noise_dof, values=rows.values)
+    sets = [found for found in sets if not _is_a_zero_alone(rows, dictionary, found)]
     explanations = posterior([(1.0, [(_names(atoms, f), (), f.log_posterior, f) for f in sets])])
     verdict = judge(explanations, explanations, lambda e: () if _is_more(rows, e.best) else None, of_classes=True)
     results = SinceResults(
@@ -263,6 +266,22 @@ def _is_more(rows: _Rows, found: FittedSet) -> bool:
 
     free = max(rows.values - found.effective, 1.0)
     return float(f.sf(found.rss / free, free, rows.noise_dof)) < _CHANCE
+
+
+def _is_a_zero_alone(rows: _Rows, dictionary: Dictionary, found: FittedSet) -> bool:
+    """Whether a set has a gear ratio that the rows show to be right: then it is its zero, which another set has."""
+    begin, sd = 0, None
+    for i, mean in zip(found.members, found.mean, strict=True):
+        atom = dictionary.atoms[i]
+        assert isinstance(atom, Atom)
+        own = torch.tensor([not c.secondary for c in atom.coefficients(rows.situation)])
+        if not bool(own.all()):
+            sd = covariance(dictionary, found).diagonal().sqrt() if sd is None else sd
+            mine = sd[begin : begin + len(mean)][own]
+            if bool(((mean[own].abs() < 3 * mine) & (mine < _KNOWN)).all()):
+                return True
+        begin += len(mean)
+    return False
 
 
 def _words(atom: Atom) -> str:

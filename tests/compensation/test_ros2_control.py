@@ -18,7 +18,7 @@ from ccnn_torch import export_model, load_mechanism
 from ccnn_torch.compensation import save_model
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import parse_yaml
-from ccnn_torch.mechanisms.mechanism_file import mechanism_text
+from ccnn_torch.mechanisms.mechanism_file import mechanism_text, urdf_text
 
 # What the controller calls, with the signatures of ros2_control in ROS 2 Jazzy; made after
 # https://control.ros.org/jazzy/doc/api (controller_interface::ChainableControllerInterface), and nothing of its code.
@@ -183,4 +183,18 @@ def test_where_offsets_of_the_joints_suffice_they_are_all_that_is_written(tmp_pa
     tree = ElementTree.fromstring(f"<robot>{files['transmissions.xml'].read_text()}</robot>")
     found = [float(str(entry.findtext("joint/offset"))) for entry in tree.findall("transmission")]
     np.testing.assert_allclose(found, zeros, atol=1e-9)
-    assert "Offsets of the joints suffice" in files["README.md"].read_text()
+    readme = files["README.md"].read_text()
+    assert "Offsets of the joints suffice" in readme and "hold nothing of" not in readme
+    # With the URDF of the robot its names; a joint at which nothing was found stays where it is.
+    row = slice(6 + 6 * 4, 12 + 6 * 4)
+    values[row] = arm.nominal[row]
+    (tmp_path / "identified.yaml").write_text(mechanism_text(arm.with_nominal(values), before))
+    urdf = urdf_text(arm)
+    (tmp_path / "robot.urdf").write_text(urdf)
+    files = export_model(
+        tmp_path / "identified.yaml", "ros2_control", tmp_path / "out", current=tmp_path / "robot.urdf"
+    )
+    tree = ElementTree.fromstring(f"<robot>{files['transmissions.xml'].read_text()}</robot>")
+    names = [entry.get("name") for entry in ElementTree.fromstring(urdf).findall("joint")]
+    assert {str(entry.get("name")) for entry in tree.findall("transmission/joint")} <= {*names}
+    assert float(str(tree.findall("transmission")[4].findtext("joint/offset"))) == 0.0

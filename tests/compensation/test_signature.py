@@ -119,7 +119,7 @@ def test_keys_of_other_kinds_and_locked_ones(copied: Path, tmp_path: Path) -> No
 def test_an_identified_machine_is_signed_without_a_card(tmp_path: Path, keys: tuple[Path, Path]) -> None:
     private, public = keys
     mechanism, path = load_mechanism("tripod"), tmp_path / "identified.yaml"
-    with pytest.raises(ModelFileError, match="there is no identified machine"):
+    with pytest.raises(ModelFileError, match="there is no such file"):
         sign_model(path, private)
     path.write_text(mechanism_text(mechanism, dict(zip("Lr", mechanism.nominal.tolist(), strict=True))))
     with pytest.raises(ModelFileError, match="has no signature"):

@@ -297,7 +297,7 @@ def test_klipper_places_the_nozzle_where_the_printer_does(tmp_path: Path) -> Non
     (tmp_path / "printer.cfg").write_text(KLIPPER_SAMPLE)
     files = export_model(path, "klipper", tmp_path / "out", current=tmp_path / "printer.cfg")
     cfg = configparser.ConfigParser(delimiters=(":", "="), inline_comment_prefixes=("#",))
-    cfg.read_string(files["printer.cfg"].read_text())
+    cfg.read_string(files["printer_delta.cfg"].read_text())
     steppers = [cfg[f"stepper_{k}"] for k in "abc"]
     radius = float(cfg["printer"]["delta_radius"])
     arm, angle, end = (
@@ -318,7 +318,7 @@ def test_klipper_places_the_nozzle_where_the_printer_does(tmp_path: Path) -> Non
         wanted = centre + (x + 1j * y) * np.exp(1j * turn)
         np.testing.assert_allclose(place, [wanted.real, wanted.imag, z], atol=2e-4)
     # Without the file that is there the change is told.
-    bare = export_model(path, "klipper", tmp_path / "out")["printer.cfg"].read_text()
+    bare = export_model(path, "klipper", tmp_path / "out")["printer_delta.cfg"].read_text()
     assert re.search(r"# position_endstop: what is there [-+]\d+\.\d{6}", bare) and "less than" in readme
     (tmp_path / "printer.cfg").write_text("[stepper_b]\nposition_endstop: 3\n")
     with pytest.raises(InputError, match=r"\[stepper_a\] has no position_endstop"):
@@ -409,7 +409,7 @@ def test_what_is_no_such_machine_is_refused_in_a_sentence(tmp_path: Path, cli: C
         (path, "linuxcnc_hal", "of hexapods and of arms of six turning joints", ()),
         (arm, "ur", "is no UR arm", ()),
         (arm, "linuxcnc_hal", "is neither", ()),
-        (arm, "c99", "--current: is read by the targets ur, pal, lerobot, klipper", ("--current", arm)),
+        (arm, "c99", "--current: is read by the targets ur, pal, lerobot, klipper, ros2_control", ("--current", arm)),
         (arm, "lerobot", "has joints that slide", ()),
     ):
         code, _, err = cli("export", file, "--to", to, "--out", tmp_path / "out", *more)

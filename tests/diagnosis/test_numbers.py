@@ -15,6 +15,7 @@ from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.diagnosis import Diagnosis
 from ccnn_torch.diagnosis.page.data import About
 from ccnn_torch.diagnosis.page.first_screen import first_screen, numbers_table, where_words
+from ccnn_torch.diagnosis.verdict.findings import findings
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.kinds.machine_file import template
 from ccnn_torch.records import write_table
@@ -110,6 +111,20 @@ def test_the_second_crank_of_a_five_bar_counts_clockwise() -> None:
     numbers["gamma2"]["sense"] = "clockwise"
     table = numbers_table(results, 6)
     assert table is not None and table.rows[0][0] == "leg 2 gamma2, clockwise"
+
+
+def test_a_wrong_theta_is_the_zero_of_a_joint() -> None:
+    arm = load_mechanism("serial", name="arm", links=[[0.3, 0.0, 0.1, 0.0]] * 3, convention="standard")
+    (sense,) = (p.sense for p in arm.geometry if p.name == "theta3")
+    theta = {"value": -5e-4, "sd": 1e-5, "unit": "rad", "part": "link 3", "nominal": 0.0, "sense": sense}
+    results = {
+        "effects": [{"name": "geometry", "parameters": {"theta3": theta}}],
+        "verdict": {"effects": ["geometry"]},
+        "rows_set_aside": [],
+    }
+    (found,) = findings(results)
+    assert "theta3 -500 µrad (zero of joint 3)" in found.text
+    assert found.look.startswith("Zero of joint 3: master the axis again.")
 
 
 @pytest.mark.parametrize(("rows", "said"), [([10, 90], ""), ([80, 20], "85 % of it in 20 % of the rows: load_y 0")])

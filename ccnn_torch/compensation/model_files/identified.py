@@ -123,6 +123,8 @@ def _parsed(path: Path, source: Path, content: bytes) -> MechanismFile:
         file = read_mechanism_file(str(source), content)
     except InputError as reason:
         raise ModelFileError(f"{reason}; {path} is no model file: give identified.yaml or model.safetensors") from None
+    if not source.is_file():
+        raise ModelFileError(f"{path}: there is no such file; give the identified.yaml that ccnn identify writes")
     if file is None:
         raise ModelFileError(
             f"{path}: there is no identified machine; give the identified.yaml that ccnn identify writes, which holds "

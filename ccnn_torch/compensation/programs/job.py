@@ -64,7 +64,8 @@ class Corrections:
         Raises:
             InputError: `tool` of a machine that is no arm.
         """
-        machine = loaded.mechanism(allow_code).controlled()
+        measured = loaded.mechanism(allow_code)
+        machine = measured.controlled()
         if isinstance(machine, SerialArm):
             keys = machine.recipe["keys"] | ({} if tool is None else {"tool": list(tool)})
             slides = len(machine.joints) <= 3
@@ -80,6 +81,8 @@ class Corrections:
             low, high = loaded.region.T
             self._region = (low + high) / 2, (0.5 + _EDGE) * (high - low)
         self.turns = len(machine.joints) > 3 and machine.frame(machine.home_pose)[1] is not None
+        # Where no orientation was measured the model does not know how the tool is turned.
+        self.unseen = self.turns and getattr(measured, "orientation", "") == "none"
 
     def require(self, path: Path) -> None:
         """Refuse a machine whose positions are no x, y, z, with or without orientation."""
@@ -109,7 +112,7 @@ class Corrections:
         if self._region is not None:
             inside = (np.abs(ideal - self._region[0]) <= self._region[1]).all(-1)
         frames = self._frames(found["command"])
-        if not self.turns:
+        if not self.turns or self.unseen:
             # What a machine does not turn stays as it is written.
             for frame, point in zip(frames, points, strict=True):
                 frame[:3, :3] = np.eye(3) if point.frame is None else point.frame[:3, :3]
@@ -236,7 +239,7 @@ def compensate_program(
     found, stands = program.written(changed)
     write_whole(output, found.encode("latin-1"))
     moved = corrections.apart(program.points, stands)
-    said = [f"{output}: {len(moved)} of {len(program.points)} positions corrected{_by(moved)}."]
+    said = [f"{output}: {len(moved)} of {len(program.points)} positions corrected{_by(moved, corrections.turns)}."]
     if damped:
         said.append(
             f"{damped} of them near a singular pose or at a limit of the joints (key limits of the machine's file), "
@@ -245,7 +248,11 @@ def compensate_program(
     if loaded.covariates:
         at = ", ".join(f"{plain(c.name)} = {v:.4g}" for c, v in zip(loaded.covariates, _middle(loaded), strict=True))
         said.append(f"A program does not say the covariates; they stand in the middle of what was measured: {at}.")
-    if base is None:
+    if corrections.unseen:
+        said.append(
+            "Orientations stay as written: none was measured, so the model does not know how the tool is turned."
+        )
+    if base is None and corrections.turns:
         said.append(
             "Positions were taken in the machine's own base, of an arm for the tool of its file; give --base and "
             "--tool where the program has others."
@@ -271,10 +278,12 @@ def _middle(loaded: LoadedModel) -> Array:
     return np.array([(edge["low"] + edge["high"]) / 2 for edge in edges])
 
 
-def _by(moved: Array) -> str:
+def _by(moved: Array, turns: bool) -> str:
     if not len(moved):
         return ""
     (most, turned), (half, half_turned) = moved.max(0), np.median(moved, 0)
+    if not turns:
+        return f", by {1e3 * most:.3g} mm at most, {1e3 * half:.3g} mm in the median"
     return (
         f", by {1e3 * most:.3g} mm and {np.degrees(turned):.3g} deg at most, {1e3 * half:.3g} mm and "
         f"{np.degrees(half_turned):.3g} deg in the median"

@@ -103,11 +103,11 @@ def _onnx(order: _Order) -> dict[str, bytes | str]:
     return dict(contents.values()) | {"controller.onnx": export_onnx(compensator, "{}", COMMAND)}
 
 
-def _table(order: _Order) -> dict[str, str]:
+def _table(order: _Order, mesh: bool = True) -> dict[str, str]:
     if order.model.machine is not None:
-        return print_tables(order.compensator(), order.model.machine.nominal)
+        return print_tables(order.compensator(), order.model.machine.nominal, mesh)
     known = "spec" in order.model.facts["mechanism"]
-    return print_tables(order.compensator(), order.mechanism() if known else None)
+    return print_tables(order.compensator(), order.mechanism() if known else None, mesh)
 
 
 def _ros2_control(order: _Order) -> Mapping[str, str]:
@@ -127,7 +127,7 @@ TARGETS: dict[str, Callable[[_Order], Mapping[str, str | bytes]]] = {
     "onnx": _onnx,
     "ros2_control": _ros2_control,
     "table": _table,
-    "beckhoff": _table,
+    "beckhoff": lambda order: _table(order, mesh=False),
     "urdf": lambda order: order.written(print_robot, "Links"),
     "mjcf": lambda order: order.written(print_robot, "Links"),
     "ur": lambda order: order.written(print_ur, "Kinematics"),
@@ -136,7 +136,7 @@ TARGETS: dict[str, Callable[[_Order], Mapping[str, str | bytes]]] = {
     "linuxcnc_hal": lambda order: order.written(print_hal, "Kinematics"),
     "lerobot": lambda order: order.written(print_lerobot, "Calibration"),
 }
-CURRENT = ("ur", "pal", "lerobot", "klipper")
+CURRENT = ("ur", "pal", "lerobot", "klipper", "ros2_control")
 """Those that take names or numbers from the user's own file."""
 
 

@@ -58,7 +58,7 @@ def klipper_numbers(parameters: Mapping[str, float]) -> tuple[float, Array, Arra
 
 
 def print_klipper(found: Found) -> Stack:
-    """`printer.cfg` with the keys of a delta's kinematics.
+    """`printer_delta.cfg` with the keys of a delta's kinematics; copied beside a printer.cfg it overwrites nothing.
 
     Raises:
         MethodFailedError: the machine is no linear delta.
@@ -86,14 +86,15 @@ def print_klipper(found: Found) -> Stack:
         # base, angle, lean, skew, platform, rod; the offset is what the endstop says.
         row[:6] = torch.tensor([abs(tower), np.angle(tower), 0.0, 0.0, 0.0, round(now[1][i], 9)])
     load = (
-        "Replace these keys in `printer.cfg`, delete them from its block `SAVE_CONFIG` (`#*#` at the end), `RESTART`, "
+        "Replace these keys in `printer.cfg`, or write `[include printer_delta.cfg]` at its end; delete them from its "
+        "block `SAVE_CONFIG` (`#*#` at the end), `RESTART`, "
         "and probe again. Endstops are written where the file that is there was given, `--current printer.cfg`; else "
         "add what the comments say. "
         f"Klipper's x and y are those of the circle through the towers: its zero is at ({1e3 * now[4].real:.4f}, "
         f"{1e3 * now[4].imag:.4f}) mm, its axes are turned by {math.degrees(now[5]):.5f} deg. It has no key for rails "
         "that lean or are skew."
     )
-    return Stack({"printer.cfg": "\n".join(lines) + "\n"}, seen(values.flatten()), load)
+    return Stack({"printer_delta.cfg": "\n".join(lines) + "\n"}, seen(values.flatten()), load)
 
 
 def print_hal(found: Found) -> Stack:

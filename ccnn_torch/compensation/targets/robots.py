@@ -186,7 +186,7 @@ def print_pal(found: Found) -> Stack:
     if found.current is None:
         raise InputError("--to pal names the joints of the robot: give its URDF as --current robot.urdf")
     path, (base, _, tool) = str(found.current), chain_of(identified)
-    joints = _joints_of(path, nominal)
+    joints = joints_of(path, nominal)
     lines = ["robot_state_publisher:", "  geometric_calibration:"]
     for joint, before, after in zip(joints, _plain(nominal), _plain(identified), strict=True):
         xyz, angles = _origin(path, joint)
@@ -268,7 +268,7 @@ def print_lerobot(found: Found) -> Stack:
 _COUNTS, _MOST_COUNTS = 4096, 2047
 
 
-def _joints_of(path: str, arm: SerialArm) -> list[Element]:
+def joints_of(path: str, arm: SerialArm) -> list[Element]:
     """The joints of a URDF that are those of the arm, by their axes and origins."""
     root = read_xml(path, URDF_LIMIT, "give the URDF of the robot")
     above = {link_of(path, joint, "child"): joint for joint in root.findall("joint")}

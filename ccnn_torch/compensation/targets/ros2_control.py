@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from xml.sax.saxutils import quoteattr
 
 import torch
 
@@ -11,7 +12,8 @@ from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.lowered import Found, Stack, arm_of, chain, left_over, rms, zeros_of
 from ccnn_torch.compensation.targets.printing import filled, wrapped
-from ccnn_torch.display import plain
+from ccnn_torch.compensation.targets.robots import joints_of
+from ccnn_torch.display import plain, visible
 from ccnn_torch.mechanisms import SerialArm
 
 # What offsets may leave of the nominal machine's error, so that no controller is worth its while [1].
@@ -30,13 +32,17 @@ def offsets_alone(found: Found) -> tuple[Stack | None, str]:
     said = left_over(held, found)
     if any(left > _SUFFICES * before for left, before in zip(rms(held, found), rms(arm, found), strict=True)):
         return None, said
+    names = [joint.name for joint in arm.joints]
     lines = ["<!-- In the URDF: replace the names, and add the offset to the one that is there. -->"]
-    for joint, zero in zip(arm.joints, zeros, strict=True):
+    if found.current is not None:
+        names = [quoteattr(visible(str(joint.get("name"))))[1:-1] for joint in joints_of(str(found.current), arm)]
+        lines = ["<!-- In the URDF: add the offset to the one that is there. -->"]
+    for name, zero in zip(names, zeros, strict=True):
         lines += [
-            f'<transmission name="{joint.name}_transmission">',
+            f'<transmission name="{name}_transmission">',
             "  <plugin>transmission_interface/SimpleTransmission</plugin>",
-            f'  <joint name="{joint.name}" role="joint1"><offset>{zero:.12f}</offset></joint>',
-            f'  <actuator name="{joint.name}_motor" role="actuator1"/>',
+            f'  <joint name="{name}" role="joint1"><offset>{zero:.12f}</offset></joint>',
+            f'  <actuator name="{name}_motor" role="actuator1"/>',
             "</transmission>",
         ]
     load = (

@@ -30,13 +30,14 @@ _RECORDS, _ALIGNED = 12, 0.05
 _NAMES = {"m": ("mm", 1e3), "rad": ("deg", 180 / np.pi)}
 
 
-def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[str, str]:
+def print_tables(compensator: Compensator, mechanism: Mechanism | None, mesh: bool = True) -> dict[str, str]:
     """Contents of the files by name: the grid, tables of single axes, a mesh, and what each leaves.
 
     Args:
         compensator: fitted; its covariates stand at the middle of the domain, but for directions of approach in tables
             of single axes.
         mechanism: nominal, for the mesh; None where it is not known.
+        mesh: whether a mesh for Klipper is wanted.
 
     Raises:
         MethodFailedError: a grid of so many joints would have less than three points along each.
@@ -66,7 +67,7 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
         told.append(
             _said("beckhoff_grid.csv", "X, Y, Z, linear between the points", truth, _between(lines, values, checked))
         )
-    if mechanism is not None and [c.name for c in mechanism.pose] == ["x", "y", "z"]:
+    if mesh and mechanism is not None and [c.name for c in mechanism.pose] == ["x", "y", "z"]:
         tables["klipper_mesh.cfg"], sentence = _mesh(compensator, mechanism)
         told.append(sentence)
     told += said
@@ -252,6 +253,12 @@ def _heidenhain(joint: str, unit: str, line: Array, up: Array, down: Array) -> s
 def _mesh(compensator: Compensator, mechanism: Mechanism) -> tuple[str, str]:
     """What is added to z over x and y in the middle of the heights [mm], and a sentence on what a mesh leaves."""
     (x0, y0, z0), (x1, y1, z1) = (v.tolist() for v in mechanism.bounds)
+    box = torch.stack([compensator.domain.low, compensator.domain.high])[:, : len(mechanism.joints)]
+    share = torch.rand(_CHECKED, box.shape[1], generator=torch.Generator().manual_seed(0), dtype=box.dtype)
+    heights = mechanism.forward_kinematics(box[0] + (box[1] - box[0]) * share)[:, 2]
+    heights = heights[heights.isfinite()]
+    # Of the box of the machine what was measured.
+    z0, z1 = max(z0, float(heights.min())), min(z1, float(heights.max()))
     xs, ys = np.linspace(x0, x1, _MESH), np.linspace(y0, y1, _MESH)
     gap = _missed(compensator, mechanism, xs, ys, (z0 + z1) / 2)
     other = _missed(compensator, mechanism, xs, ys, z0)

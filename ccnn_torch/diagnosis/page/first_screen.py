@@ -88,7 +88,9 @@ def _enter(results: Block, table: Table, about: About) -> Answer:
         shown = shown[:_ON_LINES]
         text = f"{len(shown)} of {count} numbers, ± at 95 %; only all together repair the model: {kept}report.html."
     else:
-        more = f"{count - len(shown)} more are in {kept}report.html" if count > len(shown) else "if nothing else acts"
+        more, rest = "if nothing else acts", count - len(shown)
+        if rest > 0:
+            more = f"{rest} more {'is' if rest == 1 else 'are'} in {kept}report.html"
         text = f"{'all of these together, ' * (len(enters) > 1)}± at 95 %; {more}."
     return Answer("Enter instead" if enters else "Numbers found", text, tuple(_line(row) for row in shown), table)
 

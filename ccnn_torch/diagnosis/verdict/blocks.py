@@ -16,6 +16,7 @@ from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, ROUNDING
 from ccnn_torch.diagnosis.result import effect_block, gap_block
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
+from ccnn_torch.diagnosis.verdict.findings import ZERO_OF
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Coefficient, Situation, moved
 from ccnn_torch.evidence.dictionary import FittedSet, covariance
@@ -363,7 +364,11 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
         for c, v, d in zip(coefficients, mean, deviation, strict=True)
     }
     senses = {p.name: p.sense for p in mechanism.geometry if p.sense}
-    senses |= {f"q{name.removeprefix('theta')}": sense for name, sense in senses.items() if name.startswith("theta")}
+    senses |= {
+        f"q{name.removeprefix('theta')}": sense
+        for name, sense in senses.items()
+        if name.startswith("theta") and not sense.startswith(ZERO_OF)
+    }
     for label, block in found.items():
         if sense := senses.get(label.rpartition(": ")[2], ""):
             block["sense"] = sense

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccnn_torch.diagnosis.verdict.text import listed
+from ccnn_torch.diagnosis.verdict.text import capital, listed
 from ccnn_torch.display import display_unit, number_text, own_unit, unit_text
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
@@ -31,6 +31,10 @@ _NO_GROWTH = 1e-3
 # Speeds below this [m/s or rad/s] are drifts, told by the hour.
 _DRIFT = 1e-3
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+
+
+ZERO_OF = "zero of joint "
+"""Begin of the sense of a parameter that is the zero of a joint."""
 
 
 class Finding(NamedTuple):
@@ -84,7 +88,13 @@ def findings(results: Block) -> list[Finding]:
         ]
         if like:
             text += f" (or {listed([words_of(n).short for n in like], 'or')}: these data do not distinguish them)"
-        found.append(Finding(name, text, words.look.format(where=places(most) if most else "the machine")))
+        look = words.look.format(where=places(most) if most else "the machine")
+        # What a table of links calls theta3 is the zero of joint 3 to who masters the robot.
+        zeros = [b["sense"] for n, b in clear_parameters(parameters).items() if n.startswith("theta") and "sense" in b]
+        zeros = [zero for zero in zeros if zero.startswith(ZERO_OF) and zero in text]
+        if zeros:
+            look = f"{capital(listed(zeros))}: master the axis again. {look}"
+        found.append(Finding(name, text, look))
     return found
 
 
@@ -177,6 +187,8 @@ def _sizes(parameters: Block) -> dict[str, tuple[float, str]]:
         own = own if not word else "" if word == part else f"{word} "
         value, unit = parameters[name]["value"], parameters[name]["unit"]
         size = told_words(parameters[name], value)
+        if (sense := parameters[name].get("sense", "")).startswith(ZERO_OF):
+            size += f" ({sense})"
         if not unit and (before := parameters[name].get("nominal")) is not None:
             size = f"{size_words(before, unit)} → {size_words(before + value, unit)}"
         found[part] = (sizes[part], f"{own}{size}")

@@ -116,7 +116,10 @@ def links_and_drives(
     _, names, units, _ = LINKS[convention]
     found = []
     for i, row in enumerate(links):
-        found += [Parameter(f"{p}{i + 1}", u, v) for p, u, v in zip(names, units, row, strict=True)]
+        zero = {"theta": f"zero of joint {i + 1}"} if joint_units[i] == "rad" else {}
+        found += [
+            Parameter(f"{p}{i + 1}", u, v, sense=zero.get(p, "")) for p, u, v in zip(names, units, row, strict=True)
+        ]
     for i, j, *bow in drives:
         to, by = joint_units[i - 1], joint_units[j - 1]
         if bow:
