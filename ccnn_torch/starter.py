@@ -280,7 +280,7 @@ def starter_config(
     table = read_source(records)
     if {"time", "command1", "q1"} <= {*table.names}:
         return _motion_config(records, out, mechanism, {})
-    found = recognise(table, urdf_joints(mechanism) if str(mechanism).lower().endswith(".urdf") else ())
+    found = recognise(table, urdf_joints(mechanism) if mechanism and mechanism.lower().endswith(".urdf") else ())
     if not (found.joints or found.goals) or not found.pose:
         what = "measured pose (x, y, z …)"
         if not (found.joints or found.goals):

@@ -119,7 +119,7 @@ def _begins(log: Log, part: NDArray[np.int64], stretches: Sequence[int]) -> Iter
     over = time[here][-1] - time[first]
 
     def mean(values: Array) -> Array:
-        return np.trapezoid(values[here], time[here], axis=0) / over
+        return np.asarray(np.trapezoid(values[here], time[here], axis=0) / over)
 
     faster = (speed[here][-1] - speed[first]) / over
     usual = (faster, mean(speed), mean(np.sign(speed)), mean(command), mean(position), np.zeros_like(faster))

@@ -245,8 +245,8 @@ def load_records(
             "record configurations that differ"
         )
     if lacking and not (orientation == "none" and len(coordinates) == 3):
-        shown = ", ".join(c.name for c in coordinates)
-        notes.append(f"of the pose only {shown} was measured; what moves nothing else is not seen")
+        parts = ", ".join(c.name for c in coordinates)
+        notes.append(f"of the pose only {parts} was measured; what moves nothing else is not seen")
     notes = [
         *(f"joint '{name}' is constant and carries no information" for name in still),
         *notes,

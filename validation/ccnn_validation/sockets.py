@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -158,7 +159,7 @@ def judged(seed: int, extras: tuple[str, ...]) -> dict[str, float]:
         # The ball is on the tool that was fitted, for the wanted place as well.
         drawn[6:9] = unknowns[6:9]
         wanted = ball(machine, drawn, targets)
-        sent = joints_at(lambda q, fit=unknowns: ball(machine, fit, q), wanted, targets)
+        sent = joints_at(partial(ball, machine, unknowns), wanted, targets)
         found[f"SciPy, {name}"] = reached(machine, targets, sent)
     with TemporaryDirectory() as folder:
         commands = by_package(machine, rows, targets, Path(folder))

@@ -298,9 +298,9 @@ class LoadedModel:
         """What the file itself gives for joints `s x n` and covariates `s x m`; raises what it likes."""
         if self.compensator is None:
             return run_onnx(self.session, joints, covariates)
-        given = [torch.tensor(v) for v in (joints, covariates) if v is not None]
+        beside = None if covariates is None else torch.tensor(covariates)
         with torch.no_grad():
-            found = self.compensator.run(*given, *(None,) * (2 - len(given)), ways)
+            found = self.compensator.run(torch.tensor(joints), beside, ways)
             return {name: value.numpy() for name, value in found.items()}
 
     @cached_property

@@ -198,10 +198,10 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     tolerance = SINGLE_TOLERANCE * compensator.limit.numpy()
     for row in range(len(joints)):
         one = [v[row : row + 1].numpy() for v in given]
-        found = run_onnx(session, one[0], one[1] if len(one) > 1 else None)
+        said = run_onnx(session, one[0], one[1] if len(one) > 1 else None)
         for name, wanted in zip(_OUTPUTS_FLOAT32, expected, strict=True):
             allowed = 10 * SINGLE_TOLERANCE if "guard" in name else tolerance
-            if not bool((np.abs(found[name].astype(np.float64) - wanted[row].numpy()) <= allowed).all()):
+            if not bool((np.abs(said[name].astype(np.float64) - wanted[row].numpy()) <= allowed).all()):
                 raise MethodFailedError(
                     f"single precision does not hold this model: its output '{name}' is off by more than 1e-5 of the "
                     "limit; use the float64 file"

@@ -158,13 +158,19 @@ class ByTensors(Lowering):
         if constant and isinstance(a, Value) and condition.dim() == len(a.shape):
             return a
         one, other = _alike(a), _alike(b)
-        if None not in (one, other) and isinstance(condition, Value) and self.graph.kind == TensorProto.DOUBLE:
+        if (
+            one is not None
+            and other is not None
+            and isinstance(condition, Value)
+            and self.graph.kind == TensorProto.DOUBLE
+        ):
             # A cast takes a quarter of the time of a choice, and is part of linear forms.
             if {one, other} == {0, 1} and self.graph.is_whole(a) and self.graph.is_whole(b):
                 return self._cast_to(condition if one else self._node("Not", condition), TensorProto.INT64)
             if not self.graph.is_whole(a):
                 truth = self._cast_to(condition, self.graph.kind)
-                return self.each("add", self.each("mul", truth, one - other), other)
+                made: Value = self.each("add", self.each("mul", truth, one - other), other)
+                return made
         return self._node("Where", condition, a, b, whole=self.graph.is_whole(a) and self.graph.is_whole(b))
 
     # What only moves elements.
