@@ -66,10 +66,7 @@ def start(
     """
     if records is not None and "=" in str(records) and not records.is_file():
         records, overrides = None, [str(records), *(overrides or [])]
-    if out is None:
-        if records is None:
-            raise InputError("name RECORDS.csv to begin, or --out DIR to go on")
-        out = Path("runs") / records.stem
+    out = out or _folder_of(records)
     asks = not yes and not quiet and sys.stdin is not None and sys.stdin.isatty()
     config, diagnosis, folder = out / "robot.yaml", out / "diagnosis", out / "run"
 
@@ -96,18 +93,14 @@ def start(
         check(config=config, out=str(out), quiet=quiet)
     if due(3, diagnosis / "report.html", "find the cause of the error (ccnn diagnose)"):
         diagnose(config=config, out=str(diagnosis), quiet=quiet)
-    from ccnn_torch.calibration.page import pays
-    from ccnn_torch.report.json_files import read_json
-    from ccnn_torch.report.results.run import RunResults
-
-    verdict = read_json(diagnosis / "diagnosis.json")["verdict"]
-    what = "nothing beyond the noise was found, so a model would learn noise" if verdict["none"] else "train a model"
-    if due(4, folder / "results.json", f"{what} (ccnn run)", wanted=not verdict["none"]):
+    nothing = _found_nothing(diagnosis)
+    what = "nothing beyond the noise was found, so a model would learn noise" if nothing else "train a model"
+    if due(4, folder / "results.json", f"{what} (ccnn run)", wanted=not nothing):
         if (folder / "config.yaml").is_file():
             run(resume=folder, quiet=quiet)
         else:
             run(config, overrides, out=str(folder), quiet=quiet)
-    if not pays(RunResults.model_validate(read_json(folder / "results.json"))) and not yes:
+    if not yes and not _pays(folder):
         say(f"Stopped here: the model makes held-out rows no better. Mend what the diagnosis names, or add rows; {out} "
             "holds what was done, --yes goes on.")  # fmt: skip
         return
@@ -118,3 +111,23 @@ def start(
         return
     say(f"5 of {_STEPS}: judge the model on {new_rows} (ccnn verify)")
     verify(folder / "model.safetensors", out / "verified", new_rows, quiet=quiet)
+
+
+def _folder_of(records: Path | None) -> Path:
+    if records is None:
+        raise InputError("name RECORDS.csv to begin, or --out DIR to go on")
+    return Path("runs") / records.stem
+
+
+def _found_nothing(folder: Path) -> bool:
+    from ccnn_torch.report.json_files import read_json
+
+    return bool(read_json(folder / "diagnosis.json")["verdict"]["none"])
+
+
+def _pays(folder: Path) -> bool:
+    from ccnn_torch.calibration.page import pays
+    from ccnn_torch.report.json_files import read_json
+    from ccnn_torch.report.results.run import RunResults
+
+    return pays(RunResults.model_validate(read_json(folder / "results.json")))

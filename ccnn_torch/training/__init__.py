@@ -6,7 +6,6 @@ from ccnn_torch.training.trainer import (
     Callback as Callback,
     Training as Training,
     load_checkpoint as load_checkpoint,
-    past_of as past_of,
     save_checkpoint as save_checkpoint,
     tensor_digest as tensor_digest,
     train as train,

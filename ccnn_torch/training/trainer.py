@@ -349,16 +349,6 @@ class _Run:
         self.best_step = torch.where(improved, torch.full_like(self.best_step, self.step), self.best_step)
 
 
-def past_of(path: Path) -> tuple[dict[str, Tensor], Tensor]:
-    """The history that a checkpoint holds, metrics `steps x r [x k]`, and the seconds after each step, `steps`.
-
-    Raises:
-        InputError: the checkpoint is damaged.
-    """
-    tensors, about = load_checkpoint(path)
-    return below(tensors, "history."), torch.tensor(about["clock"], dtype=torch.float64)
-
-
 @contextmanager
 def _told(learner: Learner, when: str) -> Iterator[None]:
     """A factorisation that fails inside a learner is the learner's failure, not the run's."""
