@@ -35,6 +35,20 @@ def _check_config(config: Path, records: Path) -> None:
         )
 
 
+def _nothing_found(diagnosis: Path) -> bool:
+    from ccnn_torch.report.json_files import read_json
+
+    return bool(read_json(diagnosis)["verdict"]["none"])
+
+
+def _pays(results: Path) -> bool:
+    from ccnn_torch.calibration.page import pays
+    from ccnn_torch.report.json_files import read_json
+    from ccnn_torch.report.results.run import RunResults
+
+    return pays(RunResults.model_validate(read_json(results)))
+
+
 def start(
     records: Annotated[Path | None, typer.Argument(metavar="RECORDS.csv", help="Measured rows, with headers.")] = None,
     overrides: Overrides = None,
@@ -96,18 +110,14 @@ def start(
         check(config=config, out=str(out), quiet=quiet)
     if due(3, diagnosis / "report.html", "find the cause of the error (ccnn diagnose)"):
         diagnose(config=config, out=str(diagnosis), quiet=quiet)
-    from ccnn_torch.calibration.page import pays
-    from ccnn_torch.report.json_files import read_json
-    from ccnn_torch.report.results.run import RunResults
-
-    verdict = read_json(diagnosis / "diagnosis.json")["verdict"]
-    what = "nothing beyond the noise was found, so a model would learn noise" if verdict["none"] else "train a model"
-    if due(4, folder / "results.json", f"{what} (ccnn run)", wanted=not verdict["none"]):
+    none = _nothing_found(diagnosis / "diagnosis.json")
+    what = "nothing beyond the noise was found, so a model would learn noise" if none else "train a model"
+    if due(4, folder / "results.json", f"{what} (ccnn run)", wanted=not none):
         if (folder / "config.yaml").is_file():
             run(resume=folder, quiet=quiet)
         else:
             run(config, overrides, out=str(folder), quiet=quiet)
-    if not pays(RunResults.model_validate(read_json(folder / "results.json"))) and not yes:
+    if not (yes or _pays(folder / "results.json")):
         say(f"Stopped here: the model makes held-out rows no better. Mend what the diagnosis names, or add rows; {out} "
             "holds what was done, --yes goes on.")  # fmt: skip
         return
