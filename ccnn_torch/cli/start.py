@@ -118,9 +118,10 @@ def start(
         else:
             run(config, overrides, out=str(folder), quiet=quiet)
     if not (yes or _pays(folder / "results.json")):
-        say(f"Stopped here: the model makes held-out rows no better. Mend what the diagnosis names, or add rows; {out} "
-            "holds what was done, --yes goes on.")  # fmt: skip
-        return
+        return say(
+            f"Stopped here: the model makes held-out rows no better. Mend what the diagnosis names, or add rows; "
+            f"{out} holds what was done, --yes goes on."
+        )
     if new_rows is None and asks:
         new_rows = typer.prompt("File of rows measured since, which judge the model (empty: later)", default="") or None
     if new_rows is None:
