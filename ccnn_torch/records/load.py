@@ -218,14 +218,14 @@ def load_records(
     """
     if isinstance(source, Records):
         return _loaded(source, mechanism, covariates, columns or joint_map)
-    shown = read_source(source, columns)
-    table = read_joints(shown, mechanism, joint_map, columns)
+    as_read = read_source(source, columns)
+    table = read_joints(as_read, mechanism, joint_map, columns)
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
     pose, coordinates, orientation, read = read_pose(table, mechanism, partial=True)
     _refuse_empty(table, pose, coordinates)
     _refuse_without_given(table, mechanism, pose, coordinates)
     doubt, fitting = "", getattr(mechanism, "fitting_branches", None)
-    if fitting is not None and len(coordinates) in (3, 6) and not joint_map and is_open(shown, mechanism.joints):
+    if fitting is not None and len(coordinates) in (3, 6) and not joint_map and is_open(as_read, mechanism.joints):
         there, doubt = fitting(torch.from_numpy(joints), torch.from_numpy(pose))
         joints = there.numpy()
     used = {joint.name for joint in mechanism.joints} | set(read)

@@ -246,11 +246,13 @@ def test_krl_reaches_its_frames_and_axes(tmp_path: Path, cli: Cli, arm: Arm) -> 
         f"PTP {{{krl(frames[0])},S 2,T 35,E1 0.0}} C_PTP\r\n"
         f"LIN {{E6POS: {krl(frames[1])}}}\r\nPTP {{E6AXIS: {axes},E1 5}}\r\nLIN_REL {{X 10,Y 0,Z 0,A 0,B 0,C 0}}\r\n"
         f"DECL E6POS XP3={{{krl(frames[2])},S 6,T 27}}\r\nLIN {{X 100}}\r\n$VEL.CP=0.25\r\nEND\r\n"
+        "LIN XP3\r\nCIRC XAUX, XP3\r\n"
     )
     (tmp_path / "weld.src").write_bytes(text.encode("latin-1"))
     code, screen, err = cli("compensate", arm.model, tmp_path / "weld.src", tmp_path / "out.src")
     assert code == 2 and "2 of 6 positions" in err and "a relative motion: line 9" in err
     assert "not all of its numbers are there: line 11" in err and "4 of 6 positions corrected, by " in screen
+    assert "(Offs, RelTool, names): 1 move, line 15." in screen
     found = (tmp_path / "out.src").read_bytes().decode("latin-1")
     moved = re.findall(r"^(?:PTP|LIN|DECL E6POS)\b(?!.*E6AXIS).*\{.*X .*\}", found, re.MULTILINE)
     for frame, k in zip(read_krl("\n".join(moved)), (0, 1, 2), strict=True):
@@ -264,6 +266,20 @@ def test_krl_reaches_its_frames_and_axes(tmp_path: Path, cli: Cli, arm: Arm) -> 
     assert re.sub(number, "#", found) == re.sub(number, "#", text)
     for k in (0, 1, 2, 3, 4, 8, 10, 11, 12):
         assert found.splitlines()[k] == text.splitlines()[k]
+
+
+def test_orientations_that_were_not_measured_stay(tmp_path: Path, arm: Arm, cli: Cli) -> None:
+    nominal = arm.nominal.with_orientation("none")
+    made = machine_alone(all_over(nominal), nominal.with_nominal(arm.real.nominal).nominal, margin=0.0)
+    about = fields() | {"mechanism": nominal.describe()}
+    model = save_model(tmp_path, made, about, forms=("safetensors",))["safetensors"]
+    frame = arm.at(arm.nominal, arm.joints[0])
+    (tmp_path / "p.src").write_text(f"LIN {{{krl(frame)}}}\n")
+    code, screen, _ = cli("compensate", model, tmp_path / "p.src", tmp_path / "o.src")
+    assert code == 0 and "Orientations stay as written" in screen
+    (found,) = read_krl((tmp_path / "o.src").read_text())
+    np.testing.assert_allclose(found[:3, :3], frame[:3, :3], atol=1e-7)
+    assert np.abs(found[:3, 3] - frame[:3, 3]).max() > 1e-5
 
 
 def quaternion(frame: Array) -> Array:
@@ -287,10 +303,12 @@ def test_rapid_reaches_its_targets(tmp_path: Path, cli: Cli, arm: Arm) -> None:
         f"  CONST jointtarget home:=[[{axes}],[9E9,9E9,9E9,9E9,9E9,9E9]];\n"
         "  PROC main()\n    MoveL [[x0,0,0],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]],v10,fine,t1;\n"
         f"    MoveL {targets[1]},[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]],v100,z1,t1\\WObj:=w1;\n  ENDPROC\nENDMODULE\n"
+        "MoveL Offs(p10,0,0,50),v100,z1,t1;\n"
     )
     (tmp_path / "weld.mod").write_text(text)
     code, screen, err = cli("compensate", arm.model, tmp_path / "weld.mod", tmp_path / "out.mod")
     assert code == 2 and "not all of its numbers are there: line 8" in err and "3 of 4 positions corrected" in screen
+    assert "1 move, line 12." in screen
     found = (tmp_path / "out.mod").read_text().splitlines()
     for k, line in ((0, 4), (1, 8)):
         x, y, z, *turn = (float(v) for v in re.findall(r"-?\d[\d.]*(?=[,\]])", found[line].partition("[[")[2])[:7])

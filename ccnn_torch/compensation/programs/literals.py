@@ -12,8 +12,11 @@ import numpy as np
 import torch
 
 from ccnn_torch.compensation.programs.text import NUMBER, Array, Edit, Point, edited, lines_of, masked, number_like
+from ccnn_torch.display import count_text
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_quaternion, nearest_euler
 
+# Lines that a sentence names.
+_LISTED = 5
 _REAL = rf"{NUMBER}(?:[eE][-+]?\d+)?"
 
 
@@ -38,10 +41,17 @@ class Literals(ABC):
         points: in the order of the text.
     """
 
-    def __init__(self, text: str, found: Sequence[Literal]) -> None:
+    def __init__(self, text: str, found: Sequence[Literal], computed: Sequence[int]) -> None:
+        """computed: lines of moves to positions that are no literals of this file."""
         self._text, self._found = text, found
         self.points = [literal.point for literal in found]
         self.notes: list[str] = []
+        if lines := sorted({*computed}):
+            said = f"{', '.join(map(str, lines[:_LISTED]))}{' …' * (len(lines) > _LISTED)}"
+            self.notes.append(
+                "Without a correction of their own, as no number here says where they go (Offs, RelTool, names): "
+                f"{count_text(len(lines), 'move')}, line {said}."
+            )
 
     def written(self, changed: Sequence[Array | None]) -> tuple[str, list[Array | None]]:
         """The text with other positions, frames or joints as they are in `points`, and what then stands there.
@@ -110,7 +120,10 @@ class Krl(Literals):
             values = [float(entries[name][2]) for name in names]
             point = Point(line, joints=np.radians(values)) if axes else Point(line, self._frame(values))
             found.append(Literal(point, spans, ["deg"] * len(names) if axes else ["mm"] * 3 + ["deg"] * 3))
-        super().__init__(text, found)
+        here = {name.upper() for name in re.findall(r"(\w+)(?:\[[^\]]*\])?\s*=\s*\{", shown)}
+        moves = re.finditer(r"^[ \t]*S?(?:PTP|LIN|CIRC)[ \t]+(\w+)(?:[ \t]*,[ \t]*(\w+))?", shown, re.I | re.M)
+        named = [m.start(1) for m in moves if {n.upper() for n in m.groups() if n} - here]
+        super().__init__(text, found, [line_of(place) for place in named])
 
     def _turn(self, rotation: Array, old: Sequence[float]) -> list[float]:
         angles = matrix_to_euler_zyx(torch.from_numpy(np.array(rotation))).tolist()
@@ -152,7 +165,8 @@ class Rapid(Literals):
             values = [float(v) for v in texts]
             point = Point(line, self._frame(values)) if group[3] else Point(line, joints=np.radians(values))
             found.append(Literal(point, spans, ["mm"] * 3 + ["1"] * 4 if group[3] else ["deg"] * 6))
-        super().__init__(text, found)
+        shifted = re.finditer(r"\b(?:Offs|RelTool)[ \t]*\(", shown, re.IGNORECASE)
+        super().__init__(text, found, [line_of(one.start()) for one in shifted])
 
     def _turn(self, rotation: Array, old: Sequence[float]) -> list[float]:
         quaternion = matrix_to_quaternion(torch.from_numpy(rotation.copy())).numpy()
