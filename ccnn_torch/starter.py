@@ -184,7 +184,7 @@ def suitable_mechanisms(found: Recognised, table: Table) -> list[str]:
         machine = load_mechanism(name)
         wanted = {c.name: c.unit for c in (*(() if found.goals else machine.joints), *machine.pose)}
         wanted |= {GOAL + c.name: c.unit for c in machine.pose} if found.goals else {}
-        if set(wanted) == set(theirs) and all(_fits(theirs[ours], unit) for ours, unit in wanted.items()):
+        if set(wanted) == set(theirs) and all(_kind(theirs[n]) == u for n, u in wanted.items() if theirs[n]):
             fitting.append(name)
     return fitting
 
@@ -236,10 +236,6 @@ def _repeats(rows: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> bool:
     """Whether at least a fifth of the rows repeats the position of another one, at 10 positions or more."""
     distinct = len(np.unique(rows, axis=0))
     return 10 <= distinct <= 0.8 * len(rows)
-
-
-def _fits(unit: str, si_unit: str) -> bool:
-    return not unit or _kind(unit) == si_unit
 
 
 def _kind(unit: str) -> str | None:

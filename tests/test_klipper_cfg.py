@@ -128,7 +128,9 @@ def test_from_printer_cfg_to_lines_for_printer_cfg(tmp_path: Path, cli: Cli) -> 
     code, _, error = cli("new", tmp_path / "printer.cfg", "--out", tmp_path / "delta.yaml")
     assert code == 2 and "is there already" in error
     code, out, error = cli("identify", config, f"out={tmp_path / 'run'}")
-    assert code == 0 and "printer.cfg (Klipper)" in out, error
+    # What to enter is there once.
+    assert code == 0 and "Enter in printer.cfg" in out and out.count("delta_radius") == 1, error
+    assert "no scale" not in out
     found = json.loads((tmp_path / "run" / "identified.json").read_text())
     position = found["methods"]["lm"]["test"]["position"]
     assert position["after"] < 0.2 * position["before"]
@@ -140,6 +142,8 @@ def test_from_printer_cfg_to_lines_for_printer_cfg(tmp_path: Path, cli: Cli) -> 
     (tmp_path / "printer.cfg").write_text(saved())
     code, out, error = cli("new", tmp_path / "printer.cfg", "--out", tmp_path / "basic.yaml")
     assert code == 0 and "constraint: {kind: pose}" in (tmp_path / "basic.yaml").read_text(), error
+    code, out, error = cli("identify", tmp_path / "basic.yaml", f"out={tmp_path / 'bare'}", "save_report=false")
+    assert code == 0 and "heights show no scale" in out, error
 
 
 @pytest.mark.parametrize(

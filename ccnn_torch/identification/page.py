@@ -38,7 +38,7 @@ def printer_table(results: Mapping[str, Any]) -> Table | None:
         "In mm and degrees; x is the position_endstop that was there. Lean and skew of the rails have no key in "
         "Klipper: identified.yaml holds them."
     )
-    return Table("printer.cfg (Klipper)", ("section", "key", "was", "write"), tuple(rows), note, to_type=True)
+    return Table("printer.cfg (Klipper)", ("section", "key", "was", "write"), tuple(rows), note)
 
 
 _Z95 = 1.96

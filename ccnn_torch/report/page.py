@@ -129,9 +129,6 @@ class Page:
             print_text(self.verdict, console, "bold")
         for section in self.sections:
             replace(section, tables=(), sentences=()).show(console, details)
-            for table in section.tables if not details else ():
-                if table.to_type:
-                    print_table(table, console)
         for sentence in self.cautions:
             print_text(sentence, console, "yellow")
         if not details:

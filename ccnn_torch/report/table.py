@@ -33,7 +33,6 @@ class Table:
             hold numbers and are flush right.
         details: headers of the columns that a terminal shows only where all columns fit. Files have all columns.
         page_only: a terminal does not show the table; page and files do.
-        to_type: a terminal shows the table without --details, too: what is to be typed in.
     """
 
     title: str
@@ -43,7 +42,6 @@ class Table:
     words: tuple[str, ...] = ()
     details: tuple[str, ...] = ()
     page_only: bool = False
-    to_type: bool = False
 
 
 def table_of(title: str, columns: Mapping[str, Sequence[str]], note: str = "", details: Sequence[str] = ()) -> Table:
