@@ -2,8 +2,8 @@
 
 The model is that of the diagnosis: whitened rows, linear in the coefficients about the machine as fitted so far, each
 group of coefficients with a normal prior whose scale is brought to its most probable value (MacKay 1992). What the
-rows do not show is drawn to 0, so that many effects can be there at once. Frames that are not known are as large as
-they have to be: where a machine or a plate stands is no error of it, and what they can do is no evidence.
+rows do not show is drawn to 0, so that many effects can be there at once. Frames of groups of points are as large as
+they have to be: where a plate stands is no error of the machine, and what they can do is no evidence.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ _ROUNDS, _SETTLED = 4, 1e-2
 # Steps of Levenberg and Marquardt at each, at most, the first damping, and the share of the coefficients that a last
 # step may change.
 _STEPS, _DAMPING, _LAST = 12, 1e-8, 0.1
-# Standard deviation of a frame's coordinate where the rows leave it open, in plausible errors; and the share of the
-# largest below which a direction of the frames is one that the rows leave open.
+# Standard deviation of a frame's coordinate where the rows leave it open, in plausible errors, and the share of the
+# largest below which they leave a direction open.
 _ANYWHERE, _OPEN = 1e2, 1e-9
 # Times an effect that may have any period acts, at most: a gear train errs with more than one.
 _TIMES = 2
@@ -244,9 +244,15 @@ class _Model:
             for k in self.known
             for c in k.effect.coefficients(self.situation)
         ]
-        placed = {k for frame in fitted_frames(self.situation) for k in frame}
-        for k in self.loose:
-            found.append((_FRAMES, "") if k in placed else (_PARAMETERS, self.situation.mechanism.geometry[k].unit))
+        mechanism = self.situation.mechanism
+        # Of whole poses a motion of all groups would go over from the first link to their frames, and each command
+        # would have to make up for it.
+        points = len(mechanism.pose) <= 3
+        anywhere = ["base"] if mechanism.frame_per and points else []
+        for p in (mechanism.geometry[k] for k in self.loose):
+            frame = p.name.partition("_")[0]
+            part = frame if frame in getattr(mechanism, "unknown_frames", ()) else p.unit
+            found.append((_FRAMES, "") if part in anywhere else (_PARAMETERS, part))
         return found
 
 

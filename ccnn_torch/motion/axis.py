@@ -26,20 +26,11 @@ from torch import Tensor
 from ccnn_torch.motion.compilable import is_compiled
 from ccnn_torch.motion.course import course, courses
 from ccnn_torch.motion.stage import ABSENT, TINY, Axis, Given, Has, axis_of, each_has
+from ccnn_torch.motion.stretches import PLACES, START
 
 Array = NDArray[np.float64]
 # Steps longer than this, in units of the axis' own time constant, are divided.
 _LONGEST, _MOST_PARTS = 0.6, 8
-
-
-PLACES = 8
-START = (
-    *("q0", "v0", *(f"q{k}" for k in range(PLACES)), "acceleration", "speed", "direction", "command", "position"),
-    *("torque", "error", "time", "moved"),
-)
-"""What is known of an axis at the first sample: its position and speed; positions while the log began of which the
-samples are a part, and means over that time, which tell what an integral action held; and from then to the first
-sample the integral of command less position, the time, and how far the command moved."""
 
 
 class Drive(NamedTuple):

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.shrink import FOLDS
-from ccnn_torch.motion.axis import START, Drive, simulate_axes
+from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.effects.bodies import CARRIED
 from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.known import OF, TIME, share_of
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.stage import ABSENT
-from ccnn_torch.motion.stretches import Stretches
+from ccnn_torch.motion.stretches import START, Stretches
 from ccnn_torch.motion.whiten import Whitening
 
 # Of an axis that ran away: no residual is larger, in units of the motion.

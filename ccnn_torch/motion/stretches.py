@@ -17,8 +17,16 @@ from torch import Tensor
 
 from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.axis import PLACES
 from ccnn_torch.motion.log import Log
+
+PLACES = 8
+START = (
+    *("q0", "v0", *(f"q{k}" for k in range(PLACES)), "acceleration", "speed", "direction", "command", "position"),
+    *("torque", "error", "time", "moved"),
+)
+"""What is known of an axis at the first sample: its position and speed; positions while the log began of which the
+samples are a part, and means over that time, which tell what an integral action held; and from then to the first
+sample the integral of command less position, the time, and how far the command moved."""
 
 # Seconds of the part that is judged, and of the lead.
 _JUDGED, _LEAD = 1.2, 0.3
