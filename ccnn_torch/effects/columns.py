@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 
 import torch
@@ -46,9 +47,9 @@ class OfJoints(Effect):
 
     kind = "joints"
 
+    @abstractmethod
     def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
         """Change of each joint per unit of its own coefficients, `... x t x n x m`; rows: which, `t`; None = all."""
-        raise NotImplementedError
 
     def moving(self, situation: Situation) -> list[int]:
         """Numbers, from 0, of the joints that have coefficients."""

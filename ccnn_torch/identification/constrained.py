@@ -32,6 +32,7 @@ from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig
 from ccnn_torch.identification.constrained_rows import (
     ConstraintRows,
     Kind,
+    machine_in_own_base,
     placed,
     poses_of,
     read_by,
@@ -39,13 +40,13 @@ from ccnn_torch.identification.constrained_rows import (
     rows_of,
 )
 from ccnn_torch.identification.judge import drawn_sizes
-from ccnn_torch.identification.measured import Kinematics, Measured, Rows, nominal_machine
+from ccnn_torch.identification.measured import Kinematics, Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.poses import forward_problem
 from ccnn_torch.identification.problems.problem import joined
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
-from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, PoseError, SerialArm
+from ccnn_torch.mechanisms import Instrument, Mechanism, PoseError
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.mechanisms.frames.instrument import instrument
 from ccnn_torch.records.commanded import read_joints
@@ -395,7 +396,7 @@ def identify_by_constraint(
     Returns:
         Rows, the outcome of lm, content of `identified.json`, tensors behind the pictures.
     """
-    mechanism, notes = _machine(config)
+    mechanism, notes = machine_in_own_base(config)
     rows = read_constraint(config, mechanism, given)
     if isinstance(mechanism, Instrument) and isinstance(rows.seen, Instrument):
         mechanism = rows.seen
@@ -438,27 +439,6 @@ def identify_by_constraint(
         first, last = (PoseError(error.position[0], None) for error in (before, after))
         results["promise"] = promise_block(first, last, configurations(rows.joints[held], mechanism.joints))
     return measured, {"lm": outcome}, results, arrays | picture
-
-
-def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
-    """The mechanism; of an arm one without frames per group, since the constraint has its own."""
-    mechanism = nominal_machine(config)
-    assert config.constraint is not None
-    kinds = {config.constraint.kind, *(one.kind for one in config.constraint.beside)}
-    ignored = [key for key in ("frame_per", "tool_per") if getattr(mechanism, key)]
-    if ignored and ("pose" in kinds or not isinstance(mechanism, SerialArm)):
-        raise InputError(
-            f"{config.mechanism}: {ignored[0]}: poses beside a constraint are in the machine's own base; remove the "
-            "key and give poses in that base, or remove constraint to identify from poses of several set-ups"
-        )
-    if not isinstance(mechanism, SerialArm):
-        return (Framed(mechanism, base=False, tool=True) if config.frame.tool else mechanism), []
-    if config.frame.tool:
-        raise InputError("frame.tool: an arm has a tool offset of its own, which is identified anyway; remove the key")
-    plain = mechanism.with_orientation("none")
-    arm = SerialArm(**{**plain.recipe["keys"], "unknown_frames": [], "frame_per": [], "tool_per": []})
-    said = f"{' and '.join(ignored)} of the mechanism count for nothing here: the constraint has its own placements."
-    return arm.with_nominal(plain.nominal), [said] if ignored else []
 
 
 def _known(fit: ConstraintFit) -> Known:

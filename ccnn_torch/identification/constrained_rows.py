@@ -1,4 +1,4 @@
-"""Rows of an identification without a measuring device: read, numbered and split."""
+"""Rows of an identification without a measuring device: read, numbered and split; and the machine that they are of."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from ccnn_torch.config.split import Given, rows_of_test_file, split_by, with_tes
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import BesideConfig, ConstraintConfig, IdentifyConfig
-from ccnn_torch.identification.measured import notes_of, split_records
+from ccnn_torch.identification.measured import nominal_machine, notes_of, split_records
 from ccnn_torch.identification.problems.constraints import tool_points
-from ccnn_torch.mechanisms import Instrument, Mechanism, as_measured, fit_unknown
+from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, SerialArm, as_measured, fit_unknown
 from ccnn_torch.mechanisms.frames.part import Part
 from ccnn_torch.mechanisms.frames.readings import Between, Dial, Reading, Wire
 from ccnn_torch.records import Records, Table, load_records, stack_columns
@@ -227,3 +227,24 @@ def poses_of(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tup
     about = (group, {0.0: {"pose": 0.0}}, weights, records.data_hash)
     rows = ConstraintRows(records.joints, records.pose, *about, seen=seen, notes=tuple(notes_of(records)))
     return rows, records
+
+
+def machine_in_own_base(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
+    """The mechanism; of an arm one without frames per group, since the constraint has its own."""
+    mechanism = nominal_machine(config)
+    assert config.constraint is not None
+    kinds = {config.constraint.kind, *(one.kind for one in config.constraint.beside)}
+    ignored = [key for key in ("frame_per", "tool_per") if getattr(mechanism, key)]
+    if ignored and ("pose" in kinds or not isinstance(mechanism, SerialArm)):
+        raise InputError(
+            f"{config.mechanism}: {ignored[0]}: poses beside a constraint are in the machine's own base; remove the "
+            "key and give poses in that base, or remove constraint to identify from poses of several set-ups"
+        )
+    if not isinstance(mechanism, SerialArm):
+        return (Framed(mechanism, base=False, tool=True) if config.frame.tool else mechanism), []
+    if config.frame.tool:
+        raise InputError("frame.tool: an arm has a tool offset of its own, which is identified anyway; remove the key")
+    plain = mechanism.with_orientation("none")
+    arm = SerialArm(**{**plain.recipe["keys"], "unknown_frames": [], "frame_per": [], "tool_per": []})
+    said = f"{' and '.join(ignored)} of the mechanism count for nothing here: the constraint has its own placements."
+    return arm.with_nominal(plain.nominal), [said] if ignored else []

@@ -102,8 +102,8 @@ def _usual(change: Tensor) -> float:
 
 
 # Log odds that directions, and numbers of rows, must gain beside the verdict, and beyond so many times what those of as
-# many random orders gain: in any order a row far out was reached from further in, so that directions follow the place a
-# little. Numbers of rows are then asked beside everything else.
+# many random orders gain: in any order a row at the edge is reached from nearer the middle, so that directions
+# correlate a little with the place. Numbers of rows are then asked beside everything else.
 _DIRECTIONS, _ROWS_IN_ORDER, _ORDERS = (10.0, 2.0), (5.0, 1.0), 4
 
 
