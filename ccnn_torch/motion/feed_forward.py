@@ -1,10 +1,9 @@
 """Commands that make an identified machine go where it is asked: its simulator inverted step by step.
 
-u <- u + the smoothed (wanted - simulated position), as much earlier as the position comes late, or divided by what a
-pulse of the command makes of the position: iterative learning control (Arimoto 1984; Norrlöf and Gunnarsson 2002) with
-the simulator in the place of the machine. Of some shares of either step the best is taken, and none that takes a
-command farther from the wanted position, or out of the range of the motion, than a bound. Before the motion the machine
-stands where it begins.
+u <- u + the smoothed (wanted - simulated position), divided by what a pulse of the command makes of the position:
+iterative learning control (Arimoto 1984; Norrlöf and Gunnarsson 2002) with the simulator in the place of the machine.
+Of some shares of a step the best is taken, and none that takes a command farther from the wanted position, or out of
+the range of the motion, than a bound. Before the motion the machine stands where it begins.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 
 from ccnn_torch.motion.axis import Drive, simulate_axes
-from ccnn_torch.motion.mistakes import lag_of
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.stage import ABSENT
 
@@ -160,13 +158,11 @@ def corrected_command(
     beyond = np.minimum(np.maximum(_BEYOND * np.ptp(wanted, 0), np.inf if errors is None else errors), largest)
     lowest = np.maximum(wanted - limit, wanted.min(0) - beyond)
     highest = np.minimum(wanted + limit, wanted.max(0) + beyond)
-    late = [lag_of(time, wanted[:, i], plain[:, i]) for i in range(wanted.shape[1])]
     command, position, left = wanted, plain, _rms(error)
     divided = _division(nominal, axes, time, wanted, plain, around)
     for _ in range(_STEPS):
-        ahead = np.stack([np.interp(time + t, time, e) for t, e in zip(late, error.T, strict=True)], -1)
-        moves = gaussian_filter1d(np.stack([ahead, divided(error)]), _SMOOTH / step, axis=1)
-        trials = np.concatenate([np.clip(command + share * moves, lowest, highest) for share in _SHARES])
+        move = gaussian_filter1d(divided(error), _SMOOTH / step, axis=0)
+        trials = np.stack([np.clip(command + share * move, lowest, highest) for share in _SHARES])
         # Whoever waits at the first command stands where the motion begins.
         trials[:, 0] = np.clip(rest, lowest[0], highest[0])
         found = moved(nominal, axes, time, trials, around)

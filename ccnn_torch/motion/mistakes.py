@@ -69,7 +69,7 @@ def _mistakes(logs: Sequence[Log]) -> Iterator[str]:
                 )
     longest = max(usable, key=lambda log: len(log.time))
     pairs = zip(longest.command[longest.on].T, longest.position[longest.on].T, strict=True)
-    lag = max(lag_of(longest.time, u, q) for u, q in pairs)
+    lag = max(_lag_of(longest.time, u, q) for u, q in pairs)
     if lag * _LAGS > lasted:
         yield (
             f"{names}: the position lags {lag:.3g} s behind the command, and the log lasts {lasted:.3g} s; record at "
@@ -77,7 +77,7 @@ def _mistakes(logs: Sequence[Log]) -> Iterator[str]:
         )
 
 
-def lag_of(time: Array, command: Array, position: Array) -> float:
+def _lag_of(time: Array, command: Array, position: Array) -> float:
     """The time shift at which a position is most like its command [s], `s` each; 0 where it does not move."""
     like = _likeness(command, position)
     best = int(np.argmax(like))
