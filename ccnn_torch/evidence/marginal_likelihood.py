@@ -11,12 +11,15 @@ groups that are alone need no matrix at all, and of a set its widest group is le
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+Array = NDArray[np.float64]
 
 NARROW = 128
 """Columns up to which XᵀX is made as a whole."""
@@ -164,7 +167,7 @@ def fit_sets(
     own = torch.where(real[:, :, None] & real[:, None, :], square, 0.0)
     along = torch.where(real, grams.xy[(*each, safe)], 0.0)
     none = along[:, :0]
-    parts = _Parts(none, none, own[:, :0], own, along, _members(slot, groups, own))
+    parts = _Parts.of(none, none, own[:, :0], own, along, _members(slot, groups))
     there = torch.nn.functional.pad(width > 0, (1, 0))
     if start is not None:
         start = torch.nn.functional.pad(start[0], (1, 0)), start[1]
@@ -188,13 +191,13 @@ def fit_batched_sets(
     others, slot = column_indices(begin[:, 1:], width[:, 1:])
     # -1, no column, is the last one.
     own = turned.xx[others[:, :, None], others[:, None, :]]
-    parts = _Parts(
+    parts = _Parts.of(
         turned.xx.diagonal()[index],
         turned.xy[index],
         turned.xx[index[:, :, None], others[:, None, :]],
         own,
         turned.xy[others],
-        _members(slot, width.shape[1] - 1, own),
+        _members(slot, width.shape[1] - 1),
     )
     return _most_probable(parts, width > 0, turned.yy, Prior(turned.values, noise_dof), updates, start)
 
@@ -210,7 +213,7 @@ def fit_in_axes(square: Tensor, along: Tensor, there: Tensor, yy: Tensor, prior:
         prior: of all.
     """
     none = square[..., None][..., :0]
-    parts = _Parts(square, along, none, none[:, :0], square[:, :0], none[:, :0])
+    parts = _Parts.of(square, along, none, none[:, :0], square[:, :0], none[:, :0])
     return _most_probable(parts, there[:, None], yy, prior, _UPDATES)
 
 
@@ -229,9 +232,9 @@ def column_indices(begin: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(there, columns, -1), torch.where(there, slot, -1)
 
 
-def _members(slot: Tensor, groups: int, like: Tensor) -> Tensor:
+def _members(slot: Tensor, groups: int) -> Tensor:
     """1 where a column is of a group, else 0, `b x M x groups`."""
-    return (slot[..., None] == torch.arange(groups)).to(like.dtype)
+    return (slot[..., None] == torch.arange(groups)).to(torch.float64)
 
 
 class _Parts(NamedTuple):
@@ -244,30 +247,42 @@ class _Parts(NamedTuple):
         member: 1 where a column of the others is of one of their groups, else 0, `b x M x (g - 1)`.
     """
 
-    square: Tensor
-    along: Tensor
-    across: Tensor
-    own: Tensor
-    along_rest: Tensor
-    member: Tensor
+    square: Array
+    along: Array
+    across: Array
+    own: Array
+    along_rest: Array
+    member: Array
 
-    def by_group(self, first: Tensor, rest: Tensor) -> Tensor:
+    @classmethod
+    def of(cls, *products: Tensor) -> _Parts:
+        return cls(*(v.numpy() for v in products))
+
+    def by_group(self, first: Array, rest: Array) -> Array:
         """Sums over each group's columns, `b x g`; first: that of the first group, `b`; rest: `b x M`."""
-        return torch.cat([first[:, None], (rest[:, None] @ self.member)[:, 0]], -1)
+        return np.concatenate([first[:, None], (rest[:, None] @ self.member)[:, 0]], -1)
 
 
-def _to_begin_with(parts: _Parts, there: Tensor, yy: Tensor, prior: Prior) -> tuple[Tensor, Tensor]:
+def _to_begin_with(parts: _Parts, there: Array, yy: Array, prior: Prior) -> tuple[Array, Array]:
     """log α² of each group where its prior could make the whole gap, `b x g`, and σ², a tenth of it, `b`."""
-    trace = parts.by_group(parts.square.sum(-1), parts.own.diagonal(dim1=-2, dim2=-1)).clamp_min(1e-300)
-    psi = torch.log((yy[:, None].clamp_min(1e-300) / trace).clamp(math.exp(-_LIMIT), math.exp(_LIMIT))) * there
-    noise = torch.ones_like(yy) if prior.noise_dof > 0 else (yy / prior.values / _FIRST_NOISE).clamp_min(1e-12)
+    trace = parts.by_group(_total(parts.square), np.diagonal(parts.own, axis1=-2, axis2=-1)).clip(1e-300)
+    psi = (np.log(yy.clip(1e-300))[:, None] - np.log(trace)).clip(-_LIMIT, _LIMIT) * there
+    noise = np.ones_like(yy) if prior.noise_dof > 0 else (yy / prior.values / _FIRST_NOISE).clip(1e-12)
     return psi, noise
 
 
+def _total(values: Array) -> Array:
+    """Sum over the last dimension; a product with ones is the fastest sum of short rows."""
+    total: Array = values @ np.ones(values.shape[-1])
+    return total
+
+
+@np.errstate(all="ignore")  # what is 0 or beyond all numbers is clipped
 def _most_probable(
     parts: _Parts, there: Tensor, yy: Tensor, prior: Prior, updates: int, start: tuple[Tensor, Tensor] | None = None
 ) -> Fits:
-    """Sets at their most probable scales.
+    """Sets at their most probable scales; in NumPy but for the factors, since an operation on so few numbers takes
+    torch four times as long to begin as to do.
 
     Args:
         parts: inner products.
@@ -279,51 +294,56 @@ def _most_probable(
             make the whole gap, and the noise is a tenth of it.
     """
     square, along_first, across, own, along_rest, member = parts
-    edge = own.diagonal(dim1=-2, dim2=-1)
-    yy = yy.expand(len(square))
-    psi, noise = _to_begin_with(parts, there, yy, prior) if start is None else start
+    edge, across_t = np.diagonal(own, axis1=-2, axis2=-1), across.swapaxes(-2, -1)
+    groups, total = there.numpy(), np.broadcast_to(yy.numpy(), len(square))
+    psi, noise = _to_begin_with(parts, groups, total, prior) if start is None else (v.numpy() for v in start)
     for k in range(updates + 1):
-        half, sigma = (psi / 2).exp(), noise.sqrt()[:, None]
+        half, sigma = np.exp(psi / 2), np.sqrt(noise)[:, None]
         scale_first, scale_rest = half[:, :1], (member @ half[:, 1:, None])[..., 0]
         first_in, rest_in = scale_first / sigma, scale_rest / sigma
-        diagonal = 1 + square * first_in.square()
+        diagonal = 1 + square * first_in**2
         # The first group's columns, weighted as they take part in what is left of the others.
-        weighted = across * (first_in.square() / diagonal)[..., None]
+        weighted = across * (first_in**2 / diagonal)[..., None]
         both = rest_in[:, :, None] * rest_in[:, None, :]
-        inner = (own - across.mT @ weighted).mul_(both)
-        largest = torch.nn.functional.pad(edge * rest_in.square(), (0, 1)).amax(-1, keepdim=True)
-        inner.diagonal(dim1=-2, dim2=-1).add_(1 + JITTER * largest)
-        factor = torch.linalg.cholesky_ex(inner).L
-        inverse = torch.cholesky_inverse(factor)
+        factor, inverse = _factor_and_inverse((own - across_t @ weighted) * both, edge * rest_in**2)
         c_first, c_rest = scale_first * along_first / noise[:, None], scale_rest * along_rest / noise[:, None]
-        taken = (across.mT @ (first_in / diagonal * c_first)[..., None])[..., 0]
+        taken = (across_t @ (first_in / diagonal * c_first)[..., None])[..., 0]
         u_rest = (inverse @ (c_rest - rest_in * taken)[..., None])[..., 0]
         mean = scale_rest * u_rest
         reached = (across @ mean[..., None])[..., 0]
         u_first = (c_first - first_in / sigma * reached) / diagonal
         first = scale_first * u_first
-        spread = (across.mT @ weighted.div_(diagonal[..., None])).mul_(both).mul_(inverse).sum((-2, -1))
-        gamma = parts.by_group((1 - 1 / diagonal).sum(-1) - spread, 1 - inverse.diagonal(dim1=-2, dim2=-1))
-        explained = (first * along_first).sum(-1) + (mean * along_rest).sum(-1)
-        made = (first * (square * first + 2 * reached)).sum(-1) + ((own @ mean[..., None])[..., 0] * mean).sum(-1)
-        rss = (yy - 2 * explained + made).clamp_min(0)
+        spread = ((across_t @ (weighted / diagonal[..., None])) * both * inverse).sum((-2, -1))
+        gamma = parts.by_group(_total(1 - 1 / diagonal) - spread, 1 - np.diagonal(inverse, axis1=-2, axis2=-1))
+        explained = _total(first * along_first) + _total(mean * along_rest)
+        made = _total(first * (square * first + 2 * reached)) + _total((own @ mean[..., None])[..., 0] * mean)
+        rss = (total - 2 * explained + made).clip(0)
         if k == updates:
             break
-        size = parts.by_group(u_first.square().sum(-1), u_rest.square())
-        psi, noise = _updated(psi, size, gamma, rss, there, prior)
-    log_det = diagonal.log().sum(-1) + 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    plain = -0.5 * (prior.values * noise.log() + (yy - explained) / noise + log_det)
-    plain = plain - 0.5 * prior.noise_dof * (noise.log() + 1 / noise - 1)
-    hyper = -0.5 * psi.square() / prior.spread**2 - 0.5 * torch.log1p(0.5 * gamma * prior.spread**2)
-    evidence = plain + (hyper * there).sum(-1)
+        size = parts.by_group(_total(u_first**2), u_rest**2)
+        psi, noise = _updated(psi, size, gamma, rss, groups, prior)
+    log_det = _total(np.log(diagonal)) + 2 * _total(np.log(np.diagonal(factor, axis1=-2, axis2=-1)))
+    plain = -0.5 * (prior.values * np.log(noise) + (total - explained) / noise + log_det)
+    plain = plain - 0.5 * prior.noise_dof * (np.log(noise) + 1 / noise - 1)
+    hyper = -0.5 * psi**2 / prior.spread**2 - 0.5 * np.log1p(0.5 * gamma * prior.spread**2)
+    evidence = plain + _total(hyper * groups)
     pieces = mean[..., None] * member
-    energy = torch.cat([(square * first.square()).sum(-1, keepdim=True), (pieces * (own @ pieces)).sum(1)], -1)
-    return Fits(evidence, noise, first, mean, energy, rss, gamma.sum(-1), psi, scale_rest, inverse)
+    energy = np.concatenate([_total(square * first**2)[:, None], (pieces * (own @ pieces)).sum(1)], -1)
+    fitted = (evidence, noise, first, mean, energy, rss, _total(gamma), psi, scale_rest, inverse)
+    return Fits(*(torch.from_numpy(v) for v in fitted))
 
 
-def _updated(
-    psi: Tensor, size: Tensor, gamma: Tensor, rss: Tensor, there: Tensor, prior: Prior
-) -> tuple[Tensor, Tensor]:
+def _factor_and_inverse(inner: Array, edge: Array) -> tuple[Array, Array]:
+    """Cholesky factor and inverse of 1 + `inner`, `b x M x M`; edge: largest it could have on its diagonal, `b x M`."""
+    if not inner.shape[-1]:
+        return inner, inner
+    square = torch.from_numpy(inner)
+    square.diagonal(dim1=-2, dim2=-1).add_(torch.from_numpy(1 + JITTER * edge.max(-1, keepdims=True)))
+    factor = torch.linalg.cholesky_ex(square).L
+    return factor.numpy(), torch.cholesky_inverse(factor).numpy()
+
+
+def _updated(psi: Array, size: Array, gamma: Array, rss: Array, there: Array, prior: Prior) -> tuple[Array, Array]:
     """The next log α² `b x g` and σ² `b`.
 
     MacKay's update, which takes coefficients and γ for fixed, and one of Newton's steps from there for the prior.
@@ -337,12 +357,12 @@ def _updated(
         prior: of scales and noise.
     """
     precision = 1 / prior.spread**2
-    step = torch.log(size.clamp_min(_TINY) / gamma.clamp_min(_TINY)).clamp(-_LARGEST_STEP, _LARGEST_STEP)
-    half = 0.5 * size * torch.exp(-step)
+    step = np.log(size.clip(_TINY) / gamma.clip(_TINY)).clip(-_LARGEST_STEP, _LARGEST_STEP)
+    half = 0.5 * size * np.exp(-step)
     step = step + (half - 0.5 * gamma - (psi + step) * precision) / (half + precision)
-    psi = (psi + step.clamp_(-_LARGEST_STEP, _LARGEST_STEP).mul_(there)).clamp_(-_LIMIT, _LIMIT)
-    left = (prior.values - gamma.sum(-1)).clamp_min(_FREE * prior.values + 1)
-    return psi, ((rss + prior.noise_dof) / (left + prior.noise_dof)).clamp_min(1e-12)
+    psi = (psi + step.clip(-_LARGEST_STEP, _LARGEST_STEP) * there).clip(-_LIMIT, _LIMIT)
+    left = (prior.values - _total(gamma)).clip(_FREE * prior.values + 1)
+    return psi, ((rss + prior.noise_dof) / (left + prior.noise_dof)).clip(1e-12)
 
 
 class GroupProducts(NamedTuple):
