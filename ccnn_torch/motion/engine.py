@@ -116,7 +116,7 @@ def _diagnosed(
     at_step("searching the effects")
     candidates = motion_effects(effects)
     problem = problem_of(logs, nominal, [*candidates, *nominal.own_effects])
-    nothing = problem.residual(torch.zeros(len(nominal.axes), problem.library.size, dtype=torch.float64), problem.axes)
+    nothing = problem.residual(problem.nothing, problem.axes)
     found = searched(problem, logs, nominal, lambda: problem_of(logs, nominal, candidates))
     problem = found.problem
     judged = judge_axes(found)
@@ -224,7 +224,8 @@ def _effects_of(
             single = () if tried in named else (f for f in found.found[i] if f.members == (tried,))
             fit = v.best if tried in v.best.members else next(iter(single), None)
             shown += [] if fit is None else [(e, i, fit._replace(spec=renamed(library, fit.spec, tried, e)))]
-    spread = deviations([fit for *_, fit in shown], [found.found[i][0].noise + found.form[i] for _, i, _ in shown])
+    noises = [found.found[i][0].noise + found.form[i] for _, i, _ in shown]
+    spread = deviations([fit for *_, fit in shown], found.nuisance.shape[1], noises)
     parameters: dict[int, dict[str, Any]] = {}
     for (e, i, fit), own in zip(shown, spread, strict=True):
         parameters.setdefault(e, {}).update(_parameters(library, i, fit, e, own))

@@ -41,14 +41,9 @@ def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEf
     """
     data = cut_stretches(logs)
     driven = nominal.driven(logs, data)
-    supply = torch.zeros_like(data.time)
-    if "supply" in data.beside:
-        usual = nominal.supply or float(data.beside["supply"][data.judged].median())
-        supply = data.beside["supply"] / usual - 1 if usual else supply
-    warm = torch.zeros_like(data.time)
-    if "temperature" in data.beside:
-        warm = data.beside["temperature"] - data.beside["temperature"][data.judged].min()
-    facts = [_facts(data, i, nominal, driven, supply, warm) for i in range(len(data.units))]
+    if driven.torque is not None:
+        data = data.under(driven.torque)
+    facts = [_facts(data, i, nominal, driven) for i in range(len(data.units))]
     library = library_of(effects, facts)
     if all(library.lacking):
         need = "; ".join(f"{name} needs {why}" for name, why in zip(library.names, library.lacking, strict=True))
@@ -56,11 +51,10 @@ def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEf
     span = data.position.amax((-1, -2)) - data.position.amin((-1, -2))
     unit = torch.exp2((1e-3 * span).clamp_min(1e-12).log2().round())
     pool = max(round(_POOLED / float(data.time.diff(dim=-1).median())), 1)
-    own = driven._asdict()
-    return Problem(data, library, pool=pool, supply=supply, warm=warm, unit=unit, known=nominal.known, **own)
+    return Problem(data, library, driven, unit, pool, known=nominal.known)
 
 
-def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Tensor, warm: Tensor) -> Facts:
+def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven) -> Facts:
     judged = data.judged
 
     def nearly(values: Tensor) -> float:
@@ -69,7 +63,7 @@ def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Te
 
     span = float(data.command[i][judged].max() - data.command[i][judged].min())
     # Between runs other things than the temperature change as well.
-    runs = [warm[data.run == run][judged[data.run == run]] for run in set(data.run.tolist())]
+    runs = [driven.warm[data.run == run][judged[data.run == run]] for run in set(data.run.tolist())]
     return Facts(
         unit=data.units[i],
         nominal=nominal.axes[i],
@@ -80,7 +74,7 @@ def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Te
         span=span or 1.0,
         speed=nearly(data.speed[i][judged]) or 1.0,
         error=nearly((driven.followed[i] - data.position[i])[judged]) or 1e-6,
-        supply=float(supply[judged].abs().max()) if "supply" in data.beside else 0.0,
+        supply=float(driven.supply[judged].abs().max()) if "supply" in data.beside else 0.0,
         temperature=max(float(v.max() - v.min()) for v in runs),
         ripples=_ripples(data.position[i], driven.followed[i], data.time, judged, nominal.axes[i]),
     )

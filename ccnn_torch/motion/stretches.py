@@ -76,6 +76,14 @@ class Stretches(NamedTuple):
     begin: Tensor | None
     bent: Tensor | None = None
 
+    def under(self, torque: Tensor) -> Stretches:
+        """With what resists the motors, `n x b x s`, at the first sample of the first stretch of each run."""
+        if self.begin is None:
+            return self
+        begin = self.begin.clone()
+        begin[..., START.index("torque") - 2] = torque[:, torch.searchsorted(self.run, self.run), 0]
+        return self._replace(begin=begin)
+
 
 def cut_stretches(logs: Sequence[Log]) -> Stretches:
     """Cut logs of one machine into stretches.
