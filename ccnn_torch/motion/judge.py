@@ -340,17 +340,12 @@ def _slope(values: Tensor, step: Tensor) -> Tensor:
 
 def _hats(driver: Tensor, judged: Tensor, is_even: bool = False) -> Tensor:
     """Piecewise linear functions, `n x m x b x s`, with their knots at quantiles, or evenly spaced."""
-    share = (
-        torch.linspace(0, 1, _EVENLY, dtype=driver.dtype)
-        if is_even
-        else torch.linspace(*_ENDS, _KNOTS, dtype=driver.dtype)
-    )
+    share = torch.linspace(*((0, 1, _EVENLY) if is_even else (*_ENDS, _KNOTS)), dtype=driver.dtype)
     found = driver.new_zeros(len(driver), len(share), *driver.shape[1:])
     for hats, one in zip(found, driver, strict=True):
         some = one[judged]
-        few = some[:: max(len(some) // 10_000, 1)]
         even = some.min() + share * (some.max() - some.min())
-        knots = torch.unique(even if is_even else torch.quantile(few, share))
+        knots = torch.unique(even if is_even else torch.quantile(some, share))
         if len(knots) > 2:
             place = (torch.searchsorted(knots, one.contiguous()) - 1).clamp(0, len(knots) - 2)
             within = ((one - knots[place]) / (knots[place + 1] - knots[place])).clamp(0, 1)

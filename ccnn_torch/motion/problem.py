@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -182,7 +183,7 @@ class Problem:
         """Measured less simulated, as `positions`; finite."""
         far, left = _FARTHEST * self.unit[axis, None, None], self.data.position[axis].sub_(self.positions(theta, axis))
         # What is no number is far away.
-        return torch.fmax(torch.fmin(left, far, out=left), -far, out=left)
+        return left.nan_to_num_(nan=math.inf).clamp_(-far, far)
 
     def pooled(self, residual: Tensor) -> Tensor:
         """Means over `pool` samples each, `... x s` -> `... x t`."""
