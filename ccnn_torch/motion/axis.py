@@ -90,7 +90,8 @@ def simulate_axes(
     a, has = Given(*given.T), given != np.array([*ABSENT.values()])
     # Which parameters and which run each one has.
     own = (np.arange(p)[:, None] * wide + np.arange(runs.shape[1]) % wide).ravel()
-    run = np.ascontiguousarray(runs).ravel()
+    # A copy: of one that is read-only the loop would be compiled once more.
+    run = np.array(runs).ravel()
     # The fastest motion of an axis is that of its mass on the gain: each has steps of its own, whatever is beside it.
     masses = a.inertia / np.maximum(a.gain, TINY)
     fast_ones = np.sqrt(np.where(masses > 0, masses, math.inf))[own]

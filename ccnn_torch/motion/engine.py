@@ -129,8 +129,9 @@ def _diagnosed(
     residuals = held_out(folded, found.whitening, [*steps, *alone.values()])
     # Of the model itself, also where it was linearised elsewhere.
     residuals[0] = nothing
-    verdicts, worse = no_worse(found, judged, nothing, residuals[len(names)])
-    residuals[: len(names) + 1, worse] = nothing[worse]
+    verdicts, fewer = no_worse(found, judged, tuple(members), residuals[: len(steps)])
+    for i, k in fewer.items():
+        residuals[k : len(steps), i] = residuals[k, i].clone()
     named = {m for v in verdicts for m in v.best.members}
     kept = [0, *(k + 1 for k, m in enumerate(members) if m in named)]
     names = [names[k - 1] for k in kept[1:]]
@@ -160,7 +161,7 @@ def _diagnosed(
         joints=_joints_of(problem, verdicts, nothing, residuals[len(names)]),
         next_measurements=wanted,
         not_seen={n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
-        cautions=[*cautions, *_worse_of(library, judged, worse), *_hidden_of(problem, verdicts)],
+        cautions=[*cautions, *_worse_of(library, judged, verdicts), *_hidden_of(problem, verdicts)],
         notes=_notes_of(folded, nominal, found, verdicts, total.floor, noise),
     )
     return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed, nominal)
@@ -259,14 +260,18 @@ def _joints_of(
     ]
 
 
-def _worse_of(library: Library, judged: Sequence[AxisVerdict], worse: Sequence[int]) -> list[str]:
-    """Cautions on joints of which nothing is named for that reason, a sentence each without a full stop."""
-    return [
-        f"q{i + 1}: {listed([words_of(library.names[m]).cause for m in judged[i].best.members])} fits the logs best, "
-        "but leaves more of runs not used for fitting than the model does, and is not named: the runs differ in what "
-        "they have"
-        for i in worse
-    ]
+def _worse_of(library: Library, judged: Sequence[AxisVerdict], verdicts: Sequence[AxisVerdict]) -> list[str]:
+    """Cautions on joints of which something is not named for that reason, a sentence each without a full stop."""
+    found = []
+    for i, (before, after) in enumerate(zip(judged, verdicts, strict=True)):
+        named = {*after.best.members}
+        if lost := [words_of(library.names[m]).cause for m in before.best.members if m not in named]:
+            found.append(
+                f"q{i + 1}: {listed(lost)} fits the logs best{' beside what is named' * bool(named)}, but leaves more "
+                f"of runs not used for fitting than {'that alone' if named else 'the model'} does, and is not named: "
+                "the runs differ in what they have"
+            )
+    return found
 
 
 def _hidden_of(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:

@@ -87,27 +87,38 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
 
 
 def no_worse(
-    found: Search, verdicts: Sequence[AxisVerdict], before: Tensor, after: Tensor
-) -> tuple[list[AxisVerdict], list[int]]:
-    """The verdicts, but nothing of axes of which what they name leaves more on runs that it was not fitted to.
+    found: Search, verdicts: Sequence[AxisVerdict], order: Members, residuals: Tensor
+) -> tuple[list[AxisVerdict], dict[int, int]]:
+    """The verdicts without names that leave more on runs that they were not fitted to than those before them.
 
     Args:
         found: the search.
         verdicts: of each axis.
-        before, after: residuals of nothing, and held out those of the verdicts, `n x b x s`.
+        order: all their names, the one that explains most first.
+        residuals: held out, with none of the names, and with each one more in that order, `(k + 1) x n x b x s`.
 
     Returns:
-        the verdicts, and the axes of which they are other ones.
+        the verdicts, and of axes of which they are other ones how many of the names in that order were kept.
     """
-    left, more = ((v.square() * found.problem.data.judged).sum((-1, -2)).tolist() for v in (before, after))
-    worse = [i for i, v in enumerate(verdicts) if v.best.members and more[i] > left[i]]
-    kept = list(verdicts)
-    for i in worse:
-        nothing = next(fit for fit in found.found[i] if not fit.members)
-        kept[i] = verdicts[i]._replace(
-            best=nothing, probability=min(verdicts[i].probability, _UNCONFIRMED), classes={}, hidden=None, doubted=False
-        )
-    return kept, worse
+    left = (residuals.square() * found.problem.data.judged).sum((-1, -2))
+    verdicts, kept = list(verdicts), {}
+    for i, (verdict, more) in enumerate(zip(verdicts, left.T.tolist(), strict=True)):
+        fits, k = {fit.members: fit for fit in found.found[i]}, len(order)
+        members = verdict.best.members
+
+        def first(k: int, own: Members = members) -> Members:
+            return tuple(sorted({*order[:k]} & {*own}))
+
+        # Beside a set that was not fitted a smaller one stands.
+        while k and (first(k) == first(k - 1) or more[k] > more[k - 1] or first(k) not in fits):
+            k -= 1
+        k = k if more[k] <= more[0] else 0
+        if first(k) != members:
+            kept[i], classes = k, {m: like for m, like in verdict.classes.items() if m in first(k)}
+            probability = min(verdict.probability, _UNCONFIRMED)
+            rest = {"best": fits[first(k)], "probability": probability, "classes": classes}
+            verdicts[i] = verdict._replace(**rest, hidden=None, doubted=False)
+    return verdicts, kept
 
 
 def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:

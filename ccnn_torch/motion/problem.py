@@ -175,8 +175,9 @@ class Problem:
             drive = drive._replace(**at | {"torque": torque.flatten(0, 1)})
             which = torch.arange(which.numel()).reshape(which.shape)
         moved = simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
-        for name, value in own.items():
-            moved = moved + value[:, None, None] * self.driven.own[name][axis]
+        for name, makes in self.driven.own.items():
+            if name in own:
+                moved = moved + own[name][:, None, None] * makes[axis]
         return moved
 
     def residual(self, theta: Tensor, axis: Tensor) -> Tensor:

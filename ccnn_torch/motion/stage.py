@@ -264,9 +264,10 @@ def begun(axis: Axis, start: Array, push: Array) -> State:
 def advanced(axis: Axis, has: Given, state: State, given: Sample, parts: int) -> State:
     """The state at the next sample, in so many parts."""
     fixed = _fixed(axis, has, given, parts)
-    slope, risen = (given.after - given.before) / parts, given.pushed - given.push
+    share, risen = 1.0 / parts, given.pushed - given.push
+    slope = (given.after - given.before) * share
     for i in range(parts):
-        before, first, last = given.before + i * slope, (i + GAMMA) / parts, (i + 1.0) / parts
+        before, first, last = given.before + i * slope, (i + GAMMA) * share, (i + 1.0) * share
         asked = before + GAMMA * slope + first * (1 - first) * given.bend
         middle = _stage(axis, has, fixed, state, asked, given.push + first * risen)
         between = State(
