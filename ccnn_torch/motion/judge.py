@@ -101,7 +101,8 @@ def no_worse(
         the verdicts, and of axes of which they are other ones how many of the names in that order were kept.
     """
     left = (residuals.square() * found.problem.data.judged).sum((-1, -2))
-    verdicts, kept = list(verdicts), {}
+    kept: dict[int, int] = {}
+    verdicts = list(verdicts)
     for i, (verdict, more) in enumerate(zip(verdicts, left.T.tolist(), strict=True)):
         fits, k = {fit.members: fit for fit in found.found[i]}, len(order)
         members = verdict.best.members
@@ -116,8 +117,9 @@ def no_worse(
         if first(k) != members:
             kept[i], classes = k, {m: like for m, like in verdict.classes.items() if m in first(k)}
             probability = min(verdict.probability, _UNCONFIRMED)
-            rest = {"best": fits[first(k)], "probability": probability, "classes": classes}
-            verdicts[i] = verdict._replace(**rest, hidden=None, doubted=False)
+            verdicts[i] = verdict._replace(
+                best=fits[first(k)], probability=probability, classes=classes, hidden=None, doubted=False
+            )
     return verdicts, kept
 
 
