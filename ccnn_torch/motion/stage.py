@@ -181,7 +181,7 @@ class Sample(NamedTuple):
 
 
 @compilable
-def within(value: Array, most: Array) -> Array:
+def within(value: Array, most: Array | float) -> Array:
     """The value, its size limited."""
     found: Array = np.minimum(np.maximum(value, -most), most)
     return found
