@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ccnn_torch.motion.compilable import is_compiled
 from ccnn_torch.motion.course import course, courses
-from ccnn_torch.motion.stage import ABSENT, TINY, Axis, Given, Has, axis_of, each_has
+from ccnn_torch.motion.stage import ABSENT, TINY, Axis, Given, axis_of
 from ccnn_torch.motion.stretches import PLACES, START
 
 Array = NDArray[np.float64]
@@ -86,10 +86,12 @@ def simulate_axes(
     for k, name in enumerate(ABSENT):
         if name in parameters:
             given[..., k] = parameters[name].numpy()
-    a = Given(*given.reshape(-1, len(ABSENT)).T)
+    given = given.reshape(-1, len(ABSENT))
+    a, has = Given(*given.T), given != np.array([*ABSENT.values()])
     # Which parameters and which run each one has.
     own = (np.arange(p)[:, None] * wide + np.arange(runs.shape[1]) % wide).ravel()
-    run = np.ascontiguousarray(runs).ravel()
+    # A copy: of one that is read-only the loop would be compiled once more.
+    run = np.array(runs).ravel()
     # The fastest motion of an axis is that of its mass on the gain: each has steps of its own, whatever is beside it.
     masses = a.inertia / np.maximum(a.gain, TINY)
     fast_ones = np.sqrt(np.where(masses > 0, masses, math.inf))[own]
@@ -105,9 +107,7 @@ def simulate_axes(
     )
     time, command = (np.ascontiguousarray(one.numpy()) for one in (drive.time, drive.command))
     if is_compiled() if fast is None else fast:
-        together = courses(
-            given.reshape(-1, len(ABSENT)), own, run, time, command, start, bent, push, supply, warm, parts
-        )
+        together = courses(given, has, own, run, time, command, start, bent, push, supply, warm, parts)
         return torch.from_numpy(together).reshape(*runs.shape, s)
     row = run % len(time)
     late = np.stack(
@@ -118,7 +118,7 @@ def simulate_axes(
     for many in np.unique(parts):
         here = np.flatnonzero(parts == many)
         some = Axis(*(v[own[here]] for v in axis))
-        has_any = Has(*(bool(v.any()) for v in each_has(some)))
+        has_any = Given(*has[own[here]].any(0).tolist())
         one, begin, bend, resists, volts, heat = (
             v[run[here] % len(v)].T for v in (step, start, bent, push, supply, warm)
         )

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.motion.compilable import compilable, fixed_tuple, loop, pick
-from ccnn_torch.motion.stage import TINY, Array, Axis, Given, Has, Sample, advanced, axis_of, begun, each_has
+from ccnn_torch.motion.stage import TINY, Array, Axis, Given, Sample, advanced, axis_of, begun, within
 
 
 @compilable
 def course(
     axis: Axis,
-    has: Has,
+    has: Given,
     step: Array,
     u: Array,
     start: Array,
@@ -28,7 +28,7 @@ def course(
     """What encoders show, `s` rows.
 
     Args:
-        axis, has: the axes, and what some of them have.
+        axis, has: the axes, and which parameters some of them have.
         step: time from each sample to the next, `s - 1` rows.
         u: the command, late and offset already, `s` rows.
         start: as of `Drive`, a row for each of `START`.
@@ -37,9 +37,9 @@ def course(
         parts: into how many every step is divided.
     """
     q, v = start[0], start[1]
-    if has.slow:
+    if has.slowness or has.ramp:
         u = _limited(axis, step, u, q, v, push[0])
-    if has.led:
+    if has.derivative:
         u = _led(axis, step, u)
     state = begun(axis, start, push[0])
     found, driven = np.empty_like(u), axis.at_motor > 0
@@ -62,11 +62,11 @@ def course(
             ),
             parts,
         )
-        found[k + 1] = pick(driven, state.q, state.x) if has.soft else state.q
+        found[k + 1] = pick(driven, state.q, state.x) if has.flexibility else state.q
     if not has.play:
         return found
     behind = _played(axis, found)
-    if has.hung:
+    if has.play_loaded:
         hung = _hung(axis, step, found, push)
         for k in range(len(hung)):
             behind[k] = pick(axis.play_loaded > 0, hung[k], behind[k])
@@ -88,7 +88,7 @@ def _limited(axis: Axis, step: Array, u: Array, q: Array, v: Array, push: Array)
     found[0] = pick(slow, q + load / np.maximum(axis.gain, TINY), u[0])
     # No faster than it could brake.
     begin, reach = (u[1] - u[0]) / step[0], np.sqrt(2 * most * np.abs(u[0] - found[0]))
-    pace = begin + np.minimum(np.maximum(v - begin, -reach), reach)
+    pace = begin + within(v - begin, reach)
     for k in range(len(step)):
         behind, gained, rate = u[k] - found[k], most * step[k], (u[k + 1] - u[k]) / step[k]
         # From the speed at the end of this step it comes to rest just there.
@@ -97,7 +97,7 @@ def _limited(axis: Axis, step: Array, u: Array, q: Array, v: Array, push: Array)
         asked = rate + np.sign(behind) * pick(
             ramped, np.minimum(np.abs(behind) / step[k], braking), np.abs(behind) / step[k]
         )
-        asked = np.minimum(np.maximum(asked, -fastest), fastest)
+        asked = within(asked, fastest)
         able = pick(ramped, np.minimum(np.maximum(asked, pace - gained), pace + gained), asked)
         moved = step[k] * pick(able == asked, asked, 0.5 * (pace + able))
         found[k + 1], pace = pick(slow, found[k] + moved, u[k + 1]), able
@@ -167,6 +167,7 @@ _PARAMETERS = len(Given._fields)
 @loop
 def courses(
     given: Array,
+    has: NDArray[np.bool_],
     own: NDArray[np.int64],
     run: NDArray[np.int64],
     time: Array,
@@ -181,7 +182,7 @@ def courses(
     """Courses of `c` axes, one after the other, `c x s`.
 
     Args:
-        given: parameters of axes, a row each as `Given`.
+        given, has: parameters of axes, a row each as `Given`.
         own: which of these each has, `c`.
         run: and which row of those below, which are repeated where there are fewer, `c`.
         time, command: `b x s`.
@@ -190,15 +191,25 @@ def courses(
         push, supply, warm: `b x s`, or `1 x 1` where there is nothing.
         parts: into how many the steps are divided, `c`.
     """
-    found = np.empty((len(run), time.shape[1]))
+    count = time.shape[1]
+    # Loops in the place of numpy's functions of arrays, which take half as long to compile as all the rest.
+    found, u, step = np.empty((len(run), count)), np.empty(count), np.empty(count - 1)
     for j in range(len(run)):
-        b, parameters = run[j], Given(*fixed_tuple(given[own[j]], _PARAMETERS))
-        axis = axis_of(parameters)
-        times = time[b % len(time)]
-        u = np.interp(times - axis.delay, times, command[b]) if axis.delay != 0 else command[b].copy()
-        u *= 1 + parameters.ratio
-        u += parameters.offset
+        b, axis = run[j], axis_of(Given(*fixed_tuple(given[own[j]], _PARAMETERS)))
+        times, asked, i = time[b % len(time)], command[b], 0
+        for k in range(count):
+            t = times[k] - axis.delay
+            while i < count - 1 and times[i + 1] <= t:
+                i += 1
+            late = asked[i]
+            if times[i] < t and i < count - 1:
+                late += (asked[i + 1] - late) / (times[i + 1] - times[i]) * (t - times[i])
+            u[k] = late * (1 + axis.ratio) + axis.offset
+            if k > 0:
+                step[k - 1] = times[k] - times[k - 1]
         pushed, volts, heat = push[b % len(push)], supply[b % len(supply)], warm[b % len(warm)]
-        step, has = times[1:] - times[:-1], each_has(axis)
-        found[j] = course(axis, has, step, u, start[b], bent[b % len(bent)], pushed, volts, heat, parts[j])
+        some = Given(*fixed_tuple(has[own[j]], _PARAMETERS))
+        shown = course(axis, some, step, u, start[b], bent[b % len(bent)], pushed, volts, heat, parts[j])
+        for k in range(count):
+            found[j, k] = shown[k]
     return found

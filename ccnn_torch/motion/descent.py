@@ -51,7 +51,6 @@ def sensitivities(
     theta: Tensor,
     axis: Tensor,
     places: Sequence[Sequence[int]],
-    chosen: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Whitened residuals and what numbers change in the positions.
 
@@ -63,12 +62,13 @@ def sensitivities(
     Returns:
         `p x v` and `p x m x v`, `v` values; beyond a row's own numbers 0.
     """
-    residual = _white(problem, whitening, theta, axis, chosen)
-    return residual, _columns(problem, whitening, theta, axis, places, residual, chosen)
+    residual = white_residual(problem, whitening, theta, axis)
+    return residual, _columns(problem, whitening, theta, axis, places, residual)
 
 
-def _white(problem: Problem, whitening: Whitening, theta: Tensor, axis: Tensor, chosen: Tensor | None) -> Tensor:
-    return problem.whitened(problem.residual(theta, axis, chosen), axis, whitening, chosen)
+def white_residual(problem: Problem, whitening: Whitening, theta: Tensor, axis: Tensor) -> Tensor:
+    """Whitened residuals of models `p x k` of the axes `p`, `p x v`."""
+    return problem.whitened(problem.residual(theta, axis), axis, whitening)
 
 
 def _columns(
@@ -78,7 +78,6 @@ def _columns(
     axis: Tensor,
     places: Sequence[Sequence[int]],
     residual: Tensor,
-    chosen: Tensor | None,
 ) -> Tensor:
     """As `sensitivities`; residual: whitened, `p x v`."""
     counts = torch.tensor([len(own) for own in places], dtype=torch.int64)
@@ -89,7 +88,7 @@ def _columns(
         moved = theta[which]
         moved[torch.arange(len(which)), torch.tensor([j for own in places for j in own])] += _STEP
         column = torch.cat([torch.arange(int(c)) for c in counts])
-        columns[which, column] = (residual[which] - _white(problem, whitening, moved, axis[which], chosen)) / _STEP
+        columns[which, column] = (residual[which] - white_residual(problem, whitening, moved, axis[which])) / _STEP
     return columns
 
 
@@ -108,12 +107,11 @@ def renew(
     axis: Tensor,
     places: Sequence[Sequence[int]],
     those: Tensor,
-    chosen: Tensor | None = None,
 ) -> None:
     """Simulate the columns of some rows where they are now."""
     if len(those):
         own = [places[k] for k in those.tolist()]
-        new = _columns(problem, whitening, point.theta[those], axis[those], own, point.residual[those], chosen)
+        new = _columns(problem, whitening, point.theta[those], axis[those], own, point.residual[those])
         point.columns[those, : new.shape[1]] = new
 
 
@@ -126,7 +124,6 @@ def descended(
     steps: int,
     values: float,
     goal: Tensor,
-    chosen: Tensor | None = None,
 ) -> tuple[Point, Tensor, Tensor]:
     """Where Gauss-Newton steps end, whether columns are those of there, and whether no step leads further, `p` each.
 
@@ -143,7 +140,7 @@ def descended(
     run = torch.tensor([k for k, own in enumerate(places) if own and steps], dtype=torch.int64)
 
     def white(theta: Tensor, those: Tensor) -> Tensor:
-        return _white(problem, whitening, theta, axis[those], chosen)
+        return white_residual(problem, whitening, theta, axis[those])
 
     for _ in range(_TRIALS * steps):
         if not len(run):
@@ -169,7 +166,7 @@ def descended(
         most = torch.where(residual[run].square().sum(-1) <= goal[run], steps, math.ceil(_FAR * steps))
         ended |= stale & (made[run] >= most)
         anew = run[stale & ~ended]
-        renew(problem, whitening, point, axis, places, anew, chosen)
+        renew(problem, whitening, point, axis, places, anew)
         made[anew], is_exact[anew] = made[anew] + 1, True
         run = run[~ended]
     return point, is_exact, settled
@@ -271,6 +268,6 @@ def refitted(
             begin = Point(
                 theta, *(v.reshape(*v.shape[:-1], len(problem.judged), -1)[..., rows, :].flatten(-2) for v in both)
             )
-            values, goal = float(problem.judged[rows].sum()), torch.full_like(theta[:, 0], math.inf)
-            own.append(descended(problem, whitening, begin, axis, places, 1, values, goal, rows)[0].theta)
+            some, goal = problem.of(rows), torch.full_like(theta[:, 0], math.inf)
+            own.append(descended(some, whitening, begin, axis, places, 1, some.values, goal)[0].theta)
     return [torch.cat(own) for own in found]

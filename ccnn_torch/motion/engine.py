@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.diagnosis.progress import at_step
@@ -96,8 +95,8 @@ def _apart(found: MotionDiagnosis) -> tuple[int, float] | None:
     data, runs = found.problem.data, sorted(set(found.problem.data.run.tolist()))
     if len(runs) < _FEWEST_RUNS:
         return None
-    for own in found.after.square() * data.judged:
-        left = torch.stack([own[data.run == r].sum() / data.judged[data.run == r].sum() for r in runs]).sqrt()
+    for own in found.after.square():
+        left = torch.stack([own[(data.run == r)[:, None] & data.judged].mean() for r in runs]).sqrt()
         second, first = left.sort().values[-2:].tolist()
         if first > _APART * second:
             return runs[int(left.argmax())], first / second
@@ -116,7 +115,7 @@ def _diagnosed(
     at_step("searching the effects")
     candidates = motion_effects(effects)
     problem = problem_of(logs, nominal, [*candidates, *nominal.own_effects])
-    nothing = problem.residual(torch.zeros(len(nominal.axes), problem.library.size, dtype=torch.float64), problem.axes)
+    nothing = problem.residual(problem.nothing, problem.axes)
     found = searched(problem, logs, nominal, lambda: problem_of(logs, nominal, candidates))
     problem = found.problem
     judged = judge_axes(found)
@@ -130,8 +129,9 @@ def _diagnosed(
     residuals = held_out(folded, found.whitening, [*steps, *alone.values()])
     # Of the model itself, also where it was linearised elsewhere.
     residuals[0] = nothing
-    verdicts, worse = no_worse(found, judged, nothing, residuals[len(names)])
-    residuals[: len(names) + 1, worse] = nothing[worse]
+    verdicts, fewer = no_worse(found, judged, tuple(members), residuals[: len(steps)])
+    for i, k in fewer.items():
+        residuals[k : len(steps), i] = residuals[k, i].clone()
     named = {m for v in verdicts for m in v.best.members}
     kept = [0, *(k + 1 for k, m in enumerate(members) if m in named)]
     names = [names[k - 1] for k in kept[1:]]
@@ -161,7 +161,7 @@ def _diagnosed(
         joints=_joints_of(problem, verdicts, nothing, residuals[len(names)]),
         next_measurements=wanted,
         not_seen={n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
-        cautions=[*cautions, *_worse_of(library, judged, worse), *_hidden_of(problem, verdicts)],
+        cautions=[*cautions, *_worse_of(library, judged, verdicts), *_hidden_of(problem, verdicts)],
         notes=_notes_of(folded, nominal, found, verdicts, total.floor, noise),
     )
     return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed, nominal)
@@ -169,9 +169,10 @@ def _diagnosed(
 
 # A run is apart that leaves so many times as much as any other, of so many at least.
 _APART, _FEWEST_RUNS = 4.0, 3
-_SHAPE_UNITS = {"flexible_damping": "1", "play_loaded": "1", "encoder_at_motor": "1"}
-# Of those that are over the unit of the axis.
-_OVER = {"play_friction": "s^2"}
+# Of shapes that are no speed.
+_SHAPE_UNITS = {"cogging_order": "order", "play_friction": "acceleration"} | dict.fromkeys(
+    ("flexible_damping", "play_loaded", "encoder_at_motor"), "1"
+)
 # A limit that is so far away is none.
 _TINY = 1e-9
 
@@ -179,33 +180,33 @@ _TINY = 1e-9
 def _floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -> float:
     """Mean square of what the best sets leave, or the largest model where it leaves less, summed over the axes."""
     judged = problem.data.judged
-    left = problem.residual(torch.stack([v.best.spec.theta for v in verdicts]), problem.axes)
-    each = torch.stack([left[:, judged].square().mean(-1), found.largest[:, judged].square().mean(-1)])
-    return float(each.amin(0).sum())
+    best = problem.residual(torch.stack([v.best.spec.theta for v in verdicts]), problem.axes)
+    return float(torch.stack([best, found.largest])[..., judged].square().mean(-1).amin(0).sum())
 
 
 def _where_is(problem: Problem, before: Tensor, draws: Draws) -> dict[str, Any]:
     """`where` and `where_ci95`, shares of the gap by joint and by phase of the motion; and the encoder's step."""
-    data = problem.data
-    squares, phase = before.square() * data.judged, phases_of(data)
-    joints = {f"q{i + 1}": own.sum(-1) for i, own in enumerate(squares)}
-    phases = {name: (squares * (phase == k)).sum((0, -1)) for k, name in enumerate(PHASES)}
+    data, phase = problem.data, phases_of(problem.data)
+    squares, names = before.square() * data.judged, [f"q{i + 1}" for i in range(len(before))]
+    each = torch.stack([*squares.sum(-1), *((squares * (phase == k)).sum((0, -1)) for k in range(len(PHASES)))])
     whole, q = squares.sum((0, -1)), torch.tensor(INTERVAL, dtype=torch.float64)
-    drawn = (draws.counts @ whole).clamp_min(1e-300)
-
-    def shares(parts: Mapping[str, Tensor]) -> dict[str, float]:
-        return {name: float(v.sum() / whole.sum().clamp_min(1e-300)) for name, v in parts.items()}
-
-    def ends(parts: Mapping[str, Tensor]) -> dict[str, list[float]]:
-        return {n: torch.quantile(draws.counts @ v / drawn, q).clamp(0, 1).tolist() for n, v in parts.items()}
-
-    samples = torch.stack([((phase == k) & data.judged).double().sum() for k in range(len(PHASES))])
-    time = dict(zip(PHASES, (samples / samples.sum().clamp_min(1)).tolist(), strict=True))
+    shares = (each.sum(-1) / whole.sum().clamp_min(1e-300)).tolist()
+    drawn = draws.counts @ each.mT / (draws.counts @ whole).clamp_min(1e-300)[:, None]
+    ends = torch.quantile(drawn, q, 0).clamp(0, 1).mT.tolist()
+    time = [float((phase == k)[:, data.judged].double().mean()) for k in range(len(PHASES))]
+    by_phase = zip(PHASES, shares[len(names) :], time, strict=True)
     empty: dict[str, Any] = {"outputs": {}, "legs": {}, "regions": [], "covariates": {}}
-    by_phase = {n: {"share": s, "samples": time[n]} for n, s in shares(phases).items()}
     return {
-        "where": empty | {"joints": shares(joints), "phases": by_phase},
-        "where_ci95": empty | {"joints": ends(joints), "phases": ends(phases)},
+        "where": empty
+        | {
+            "joints": dict(zip(names, shares, strict=False)),
+            "phases": {name: {"share": share, "samples": samples} for name, share, samples in by_phase},
+        },
+        "where_ci95": empty
+        | {
+            "joints": dict(zip(names, ends, strict=False)),
+            "phases": dict(zip(PHASES, ends[len(names) :], strict=True)),
+        },
         "encoder_step": _resolution(data) or None,
     }
 
@@ -224,7 +225,8 @@ def _effects_of(
             single = () if tried in named else (f for f in found.found[i] if f.members == (tried,))
             fit = v.best if tried in v.best.members else next(iter(single), None)
             shown += [] if fit is None else [(e, i, fit._replace(spec=renamed(library, fit.spec, tried, e)))]
-    spread = deviations([fit for *_, fit in shown], [found.found[i][0].noise + found.form[i] for _, i, _ in shown])
+    noises = [found.found[i][0].noise + found.form[i] for _, i, _ in shown]
+    spread = deviations([fit for *_, fit in shown], found.nuisance.shape[1], noises)
     parameters: dict[int, dict[str, Any]] = {}
     for (e, i, fit), own in zip(shown, spread, strict=True):
         parameters.setdefault(e, {}).update(_parameters(library, i, fit, e, own))
@@ -258,14 +260,18 @@ def _joints_of(
     ]
 
 
-def _worse_of(library: Library, judged: Sequence[AxisVerdict], worse: Sequence[int]) -> list[str]:
-    """Cautions on joints of which nothing is named for that reason, a sentence each without a full stop."""
-    return [
-        f"q{i + 1}: {listed([words_of(library.names[m]).cause for m in judged[i].best.members])} fits the logs best, "
-        "but leaves more of runs not used for fitting than the model does, and is not named: the runs differ in what "
-        "they have"
-        for i in worse
-    ]
+def _worse_of(library: Library, judged: Sequence[AxisVerdict], verdicts: Sequence[AxisVerdict]) -> list[str]:
+    """Cautions on joints of which something is not named for that reason, a sentence each without a full stop."""
+    found = []
+    for i, (before, after) in enumerate(zip(judged, verdicts, strict=True)):
+        named = {*after.best.members}
+        if lost := [words_of(library.names[m]).cause for m in before.best.members if m not in named]:
+            found.append(
+                f"q{i + 1}: {listed(lost)} fits the logs best{' beside what is named' * bool(named)}, but leaves more "
+                f"of runs not used for fitting than {'that alone' if named else 'the model'} does, and is not named: "
+                "the runs differ in what they have"
+            )
+    return found
 
 
 def _hidden_of(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
@@ -333,34 +339,29 @@ def _notes_of(
 
 
 def _resolution(data: Stretches) -> float:
-    """Steps of the encoders that move, root of their summed squares, as the floor is of all joints; 0 where one has
-    none."""
-    moving = [position[data.judged].numpy() for position in data.position]
-    steps = [_step_of(position) for position in moving if np.ptp(position) > 0]
-    return math.hypot(*steps) if all(steps) else 0.0
-
-
-def _step_of(position: NDArray[np.float64]) -> float:
-    """The smallest change of a joint, where nearly all are multiples of it; else 0."""
-    steps = np.diff(np.unique(position))
-    steps = steps[steps > 1e-9]
-    if not len(steps):
-        return 0.0
-    least = float(steps.min())
-    whole = np.abs(steps / least - np.round(steps / least)) < 0.1
-    return least if whole.mean() > 0.9 else 0.0
+    """Steps of the encoders that move, the smallest changes of which nearly all are multiples, root of their summed
+    squares, as the floor is of all joints; 0 where one has none."""
+    found = []
+    for position in data.position[:, data.judged].numpy():
+        steps = np.diff(np.unique(position))
+        steps = steps[steps > 1e-9]
+        if len(steps):
+            times = steps / steps.min()
+            found.append(float(steps.min()) if (np.abs(times - np.round(times)) < 0.1).mean() > 0.9 else 0.0)
+    return math.hypot(*found) if all(found) else 0.0
 
 
 def _unit(unit: str, axis: Facts) -> tuple[str, float]:
     """The unit of a number in words of the axis, and the factor to it: torques by the gain, where it is known."""
-    gain = axis.gain or 1.0
-    force = "N*m" if axis.unit == "rad" else "N"
+    gain, turns = axis.gain or 1.0, axis.unit == "rad"
+    force = "N*m" if turns else "N"
     known = {
         "joint": (axis.unit, 1.0),
+        "order": ("1" if turns else "rad/m", 1.0),
         "speed": (f"{axis.unit}/s", 1.0),
         "acceleration": (f"{axis.unit}/s^2", 1.0),
         "torque": (force if axis.gain else axis.unit, gain),
-        "inertia": ("kg*m^2" if axis.unit == "rad" else "kg", gain) if axis.gain else ("s^2", 1.0),
+        "inertia": ("kg*m^2" if turns else "kg", gain) if axis.gain else ("s^2", 1.0),
         "viscous": (f"{force}*s/{axis.unit}", gain) if axis.gain else ("s", 1.0),
     }
     return known.get(unit, (unit, 1.0))
@@ -371,32 +372,27 @@ def _parameters(library: Library, axis: int, fit: Fit, effect: int, deviation: T
 
     deviation: of the fit's numbers, in plausible sizes.
     """
-    facts = library.facts[axis]
-    found: dict[str, dict[str, Any]] = {}
+    facts, theta, found = library.facts[axis], fit.spec.theta.tolist(), dict[str, dict[str, Any]]()
+
+    def told(name: str, value: float, sd: float | None, of: str, more: Mapping[str, float]) -> None:
+        unit, factor = _unit(of, facts)
+        size = {"value": value * factor, "sd": None if sd is None else sd * factor}
+        found[f"q{axis + 1} {name}"] = {**size, "unit": unit, "part": f"joint {axis + 1}", **more}
+
     flat = fit.spec.flat
     for j in (j for j in library.places[effect] if j in flat):
         number: Number = library.numbers[axis][j]
-        unit, factor = _unit(number.unit, facts)
-        value = float(fit.spec.theta[j]) * number.scale
-        sd = float(deviation[flat.index(j)]) * number.scale
+        value, sd = theta[j] * number.scale, float(deviation[flat.index(j)]) * number.scale
         if number.inverse:
-            value += facts.nominal.get(number.acts[0][0], 0.0)
+            value += facts.nominal.get(number.acts[0].parameter, 0.0)
             if value < _TINY:
                 continue
             value, sd = 1 / value, sd / value**2
         if all(act.how == "factor" for act in number.acts):
             sd, value = sd * math.exp(value), math.expm1(value)
-        found[f"q{axis + 1} {number.name}"] = {
-            "value": value * factor,
-            "sd": sd * factor,
-            "unit": unit,
-            "part": f"joint {axis + 1}",
-        } | ({} if number.model is None else {"nominal": number.model})
+        told(number.name, value, sd, number.unit, {} if number.model is None else {"nominal": number.model})
     own = {place for variant in library.variants[effect] for place in variant.held}
     for name, place in library.held.items():
-        value = float(fit.spec.theta[place])
-        if place in own and value:
-            order = "1" if facts.unit == "rad" else "rad/m"
-            unit = order if name == "cogging_order" else _SHAPE_UNITS.get(name, f"{facts.unit}/{_OVER.get(name, 's')}")
-            found[f"q{axis + 1} {name}"] = {"value": value, "sd": None, "unit": unit, "part": f"joint {axis + 1}"}
+        if place in own and theta[place]:
+            told(name, theta[place], None, _SHAPE_UNITS.get(name, "speed"), {})
     return found

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.dictionary import CERTAIN
 from ccnn_torch.evidence.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_variance
-from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of, scaled
+from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, scaled
 from ccnn_torch.motion.descent import Point, descended, lots, padded, renew, sensitivities
 from ccnn_torch.motion.effects import EXACT
 from ccnn_torch.motion.problem import Problem
@@ -62,8 +63,7 @@ def _fit_lot(
 ) -> list[Fit]:
     axis, places = torch.tensor([i for i, _ in specs]), [s.moved for _, s in specs]
     theta = torch.stack([s.theta for _, s in specs])
-    judged = problem.judged
-    values = float(judged.sum())
+    judged, values = problem.judged, problem.values
     goal = torch.full_like(theta[:, 0], math.inf) if reached is None else _NEAR * reached[axis]
     begin = Point(theta, *sensitivities(problem, whitening, theta, axis, places))
     point, is_exact, settled = descended(problem, whitening, begin, axis, places, steps, values, goal)
@@ -107,40 +107,45 @@ def _fits_of(
     # Runs of one stretch each have no parts.
     once = shares if int(folds[1].max()) > 0 else [0.0] * len(specs)
     y = residual + (own[:, None] @ x)[:, 0]
-    both = torch.cat([x, nuisance], 1)
-    grams = Grams(both @ both.mT, (both @ y[..., None])[..., 0], y.square().sum(-1), values)
-    found = fit_sets(grams, groups, 0.0)
+    grams, beside = products(nuisance, x, y, values), nuisance.shape[1]
+    found = weighed(grams, beside, groups, None)
     unseen = y.new_zeros(len(specs))
     for within, fold in enumerate(folds):
         those = torch.tensor([k for k, share in enumerate(once) if (share > _ONCE) == within], dtype=torch.int64)
         if len(those):
             some = Fits(*(value[those] for value in found))
             unseen[those] = squares_unseen(x[those], y[those], some, [groups[k] for k in those.tolist()], fold)
-    counts, beside = [len(spec.flat) for spec in specs], torch.arange(x.shape[1], both.shape[1])
-    kept = [torch.cat([torch.arange(m), beside]) for m in counts]
     return [
         Fit(
             spec,
             evidence if math.isfinite(evidence) else -math.inf,
-            float(found.noise[k]),
-            found.covariance[k, : counts[k], : counts[k]],
-            float(residual[k].square().sum()),
-            float(unseen[k]),
+            noise,
+            found.covariance[k, :m, :m],
+            rss,
+            held,
             once[k],
             left[k],
-            Grams(grams.xx[k][at[:, None], at], grams.xy[k, at], grams.yy[k], values),
+            Grams(grams.xx[k, : beside + m, : beside + m], grams.xy[k, : beside + m], grams.yy[k], values),
             False,
         )
-        for k, (spec, evidence, at) in enumerate(zip(specs, found.log_evidence.tolist(), kept, strict=True))
+        for k, (spec, m, evidence, noise, rss, held) in enumerate(
+            zip(
+                specs,
+                [len(spec.flat) for spec in specs],
+                *(v.tolist() for v in (found.log_evidence, found.noise, residual.square().sum(-1), unseen)),
+                strict=True,
+            )
+        )
     ]
 
 
-def products(x: Tensor, nuisance: Tensor, y: Tensor, values: float) -> Grams:
-    """Inner products of whitened columns, `m x v`, and after them of what nominal values may be off by, `k x v`.
+def products(nuisance: Tensor, x: Tensor, y: Tensor, values: float) -> Grams:
+    """Inner products of what nominal values may be off by, `… k x v`, and after them of columns, `… m x v`.
 
-    y: what they explain, `v`; values: how many of it count.
+    y: what they explain, `… v`; values: how many of it count. All are whitened.
     """
-    return grams_of(torch.cat([x, nuisance]).mT[:, None, :], y[:, None])._replace(values=values)
+    both = torch.cat([nuisance, x], -2)
+    return Grams(both @ both.mT, (both @ y[..., None])[..., 0], y.square().sum(-1), values)
 
 
 def _in_one(does: Tensor, fold: Tensor) -> float:
@@ -173,100 +178,89 @@ def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Sequence[Te
 
 
 def form_errors(
-    problem: Problem, whitening: Whitening, best: Sequence[Sequence[Fit]], least: Sequence[float]
+    problem: Problem, whitening: Whitening, nuisance: Tensor, best: Sequence[Sequence[Fit]], least: Sequence[float]
 ) -> list[float]:
     """Variance in every direction by which the forms of each axis' set and of the nominal model may be wrong.
 
     Args:
         problem: the data.
         whitening: of the residual.
+        nuisance: as of `fit_many`.
         best: sets of each axis, none of which is clearly the best: the one whose forms are known best counts.
         least: the variance of each axis is at least that.
     """
-    theta = torch.zeros(len(best), problem.library.size, dtype=torch.float64)
     # Of a model each of whose values was told how well it is known, that is all that it may be off by.
     is_told = problem.unsure and problem.unsure.keys() <= problem.known.keys()
     nominal = 0.0 if is_told else _OF_NOMINAL
     command, names = problem.data.command, problem.library.names
     does, most = (
         problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
-        for v in (problem.positions(theta, problem.axes), problem.data.position)
+        for v in (problem.positions(problem.nothing, problem.axes), problem.data.position)
     )
 
     def of_set(axis: int, fit: Fit) -> float:
         shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in fit.members]
-        energy = fit_sets(fit.grams, [fit.spec.groups], 0.0).energy[0].tolist()[: len(shares)]
+        energy = weighed(fit.grams, nuisance.shape[1], [fit.spec.groups], None).energy[0].tolist()[: len(shares)]
         return form_variance([*shares, nominal], [*energy, does[axis]], max(most[axis], does[axis]))
 
     return [max(min(of_set(i, fit) for fit in own), least[i]) for i, own in enumerate(best)]
 
 
-def weighed(grams: Grams, sets: Sequence[Sequence[Tensor]], columns: int, variance: float | None) -> Fits:
+def weighed(grams: Grams, beside: int, sets: Sequence[Sequence[Tensor]], variance: float | None) -> Fits:
     """Sets under a noise that is known, or that each leaves.
 
     Args:
-        grams: of the columns, and after them of those by which the nominal values may be off, coefficients of standard
+        grams: of `products`, of all sets or of each.
+        beside: how many of its columns, the first ones, nominal values may be off by, with coefficients of standard
             deviation 1: they add to the noise.
-        sets: of groups of columns.
-        columns: how many are fitted.
+        sets: of groups of the other columns.
         variance: of the noise; None = what each set leaves, nominal values being exact.
     """
+    own = Grams(grams.xx[..., beside:, beside:], grams.xy[..., beside:], grams.yy, grams.values)
     if variance is None:
-        return fit_sets(grams, sets, 0.0)
-    return fit_sets(_under_noise(grams, columns, variance), sets, CERTAIN * grams.values)
+        return fit_sets(own, sets, 0.0)
+    own, across = scaled(own, variance), torch.cat([grams.xx[..., :beside, beside:], grams.xy[..., :beside, None]], -1)
+    inner = grams.xx[..., :beside, :beside] / variance + torch.eye(beside, dtype=across.dtype)
+    taken = across.mT @ torch.linalg.solve(inner, across) / variance**2
+    own = Grams(own.xx - taken[..., :-1, :-1], own.xy - taken[..., :-1, -1], own.yy - taken[..., -1, -1], own.values)
+    return fit_sets(own, sets, CERTAIN * own.values)
 
 
-def evidences(models: Sequence[tuple[Grams, Sequence[Tensor]]], variance: float) -> list[float]:
-    """Log evidence of models that have columns of their own, all at once.
+class HasGrams(Protocol):
+    """What is weighed beside others."""
 
-    Args:
-        models: inner products as `weighed` takes them, and the groups of the columns that are fitted.
-        variance: of the noise.
-    """
-    apart = side_by_side([_under_noise(grams, sum(map(len, groups)), variance) for grams, groups in models])
-    found: list[float] = fit_sets(apart, [groups for _, groups in models], CERTAIN * apart.values).log_evidence.tolist()
-    return found
+    @property
+    def grams(self) -> Grams: ...
 
 
-def side_by_side(models: Sequence[Grams]) -> Grams:
+def side_by_side(models: Sequence[HasGrams]) -> Grams:
     """Inner products of `p` models as those of one batch, padded with 0 to the widest."""
-    widest = max(len(own.xy) for own in models)
+    each = [model.grams for model in models]
+    widest = max(len(own.xy) for own in each)
 
     def wide(values: Tensor) -> Tensor:
         return torch.nn.functional.pad(values, (0, widest - values.shape[-1]) * values.dim())
 
-    return Grams(
-        torch.stack([wide(own.xx) for own in models]),
-        torch.stack([wide(own.xy) for own in models]),
-        torch.stack([own.yy for own in models]),
-        models[0].values,
-    )
+    xx, xy = (torch.stack([wide(v) for v in own]) for own in ([g.xx for g in each], [g.xy for g in each]))
+    return Grams(xx, xy, torch.stack([own.yy for own in each]), each[0].values)
 
 
-def _under_noise(grams: Grams, columns: int, variance: float) -> Grams:
-    """Of the columns that are fitted alone, in units of a noise to which the others add."""
-    g = scaled(grams, variance)
-    across = torch.cat([g.xx[columns:, :columns], g.xy[columns:, None]], -1)
-    inner = g.xx[columns:, columns:] + torch.eye(len(across), dtype=across.dtype)
-    taken = across.mT @ torch.linalg.solve(inner, across)
-    return Grams(
-        g.xx[:columns, :columns] - taken[:-1, :-1], g.xy[:columns] - taken[:-1, -1], g.yy - taken[-1, -1], g.values
-    )
-
-
-def deviations(fits: Sequence[Fit], variances: Sequence[float]) -> list[Tensor]:
+def deviations(fits: Sequence[Fit], beside: int, variances: Sequence[float]) -> list[Tensor]:
     """Standard deviations of the numbers of sets, `m` in plausible sizes each, under noises that hold form errors too.
 
-    The values of the nominal model are taken for exact here.
+    The values of the nominal model, `beside` columns, are taken for exact here.
     """
     if not fits:
         return []
-    own = []
-    for fit, variance in zip(fits, variances, strict=True):
-        m = len(fit.spec.flat)
-        grams = fit.grams._replace(xx=fit.grams.xx[:m, :m], xy=fit.grams.xy[:m])
-        own.append(scaled(grams, max(variance, fit.noise)))
-    found = fit_sets(side_by_side(own), [fit.spec.groups for fit in fits], CERTAIN * own[0].values)
+    grams = side_by_side(fits)
+    noise = torch.tensor([max(v, fit.noise) for v, fit in zip(variances, fits, strict=True)], dtype=grams.yy.dtype)
+    own = Grams(
+        grams.xx[:, beside:, beside:] / noise[:, None, None],
+        grams.xy[:, beside:] / noise[:, None],
+        grams.yy / noise,
+        grams.values,
+    )
+    found = fit_sets(own, [fit.spec.groups for fit in fits], CERTAIN * own.values)
     spread = found.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     return [sd[: len(fit.spec.flat)] for sd, fit in zip(spread, fits, strict=True)]
 

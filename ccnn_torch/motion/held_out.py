@@ -32,7 +32,7 @@ def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spe
     parts = [(problem.fold != k).nonzero()[:, 0] for k in folds]
     for k, theta in enumerate(refitted(problem, whitening, pairs, parts)):
         here = (problem.fold == k).nonzero()[:, 0]
-        left[:, here] = problem.residual(theta, axis, here)
+        left[:, here] = problem.of(here).residual(theta, axis)
     return left.reshape(len(sets), -1, *left.shape[1:])
 
 

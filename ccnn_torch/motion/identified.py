@@ -96,10 +96,10 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
         axes=axes,
     )
     if "supply" in data.beside:
-        content.supply = float((data.beside["supply"] / (1 + found.problem.supply)).nanmedian())
+        content.supply = float((data.beside["supply"] / (1 + found.problem.driven.supply)).nanmedian())
         nominal = replace(nominal, supply=content.supply)
     if "temperature" in data.beside:
-        content.temperature = float((data.beside["temperature"] - found.problem.warm).median())
+        content.temperature = float((data.beside["temperature"] - found.problem.driven.warm).median())
     files = [IDENTIFIED]
     if nominal.name == "servo":
         content.mechanism_keys = axis_keys(nominal, axes, _mass(found))

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.evidence.judge import judge, marginal, posterior
-from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets
+from ccnn_torch.evidence.marginal_likelihood import Grams
 from ccnn_torch.evidence.priors import OUTSIDE, crowd
 from ccnn_torch.motion.descent import sensitivities
-from ccnn_torch.motion.fit import evidences, products, side_by_side, squares_unseen
+from ccnn_torch.motion.fit import products, side_by_side, squares_unseen, weighed
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, log_posterior
 from ccnn_torch.motion.spec import Fit, Spec
@@ -87,27 +87,40 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
 
 
 def no_worse(
-    found: Search, verdicts: Sequence[AxisVerdict], before: Tensor, after: Tensor
-) -> tuple[list[AxisVerdict], list[int]]:
-    """The verdicts, but nothing of axes of which what they name leaves more on runs that it was not fitted to.
+    found: Search, verdicts: Sequence[AxisVerdict], order: Members, residuals: Tensor
+) -> tuple[list[AxisVerdict], dict[int, int]]:
+    """The verdicts without names that leave more on runs that they were not fitted to than those before them.
 
     Args:
         found: the search.
         verdicts: of each axis.
-        before, after: residuals of nothing, and held out those of the verdicts, `n x b x s`.
+        order: all their names, the one that explains most first.
+        residuals: held out, with none of the names, and with each one more in that order, `(k + 1) x n x b x s`.
 
     Returns:
-        the verdicts, and the axes of which they are other ones.
+        the verdicts, and of axes of which they are other ones how many of the names in that order were kept.
     """
-    left, more = ((v.square() * found.problem.data.judged).sum((-1, -2)).tolist() for v in (before, after))
-    worse = [i for i, v in enumerate(verdicts) if v.best.members and more[i] > left[i]]
-    kept = list(verdicts)
-    for i in worse:
-        nothing = next(fit for fit in found.found[i] if not fit.members)
-        kept[i] = verdicts[i]._replace(
-            best=nothing, probability=min(verdicts[i].probability, _UNCONFIRMED), classes={}, hidden=None, doubted=False
-        )
-    return kept, worse
+    left = (residuals.square() * found.problem.data.judged).sum((-1, -2))
+    kept: dict[int, int] = {}
+    verdicts = list(verdicts)
+    for i, (verdict, more) in enumerate(zip(verdicts, left.T.tolist(), strict=True)):
+        fits, k = {fit.members: fit for fit in found.found[i]}, len(order)
+        members = verdict.best.members
+
+        def first(k: int, own: Members = members) -> Members:
+            return tuple(sorted({*order[:k]} & {*own}))
+
+        # Beside a set that was not fitted a smaller one stands.
+        while k and (first(k) == first(k - 1) or more[k] > more[k - 1] or first(k) not in fits):
+            k -= 1
+        k = k if more[k] <= more[0] else 0
+        if first(k) != members:
+            kept[i], classes = k, {m: like for m, like in verdict.classes.items() if m in first(k)}
+            probability = min(verdict.probability, _UNCONFIRMED)
+            verdicts[i] = verdict._replace(
+                best=fits[first(k)], probability=probability, classes=classes, hidden=None, doubted=False
+            )
+    return verdicts, kept
 
 
 def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
@@ -117,9 +130,9 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     unseen = {f.members: f.unseen for f in fits}
     sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f)) for f in fits]
     sets += with_drivers(found, axis, drivers, by_members)
-    levels, twins = [], problem.library.twins
+    levels, twins, beside = [], problem.library.twins, found.nuisance.shape[1]
     for level in LEVELS:
-        weights = _weights(sets, fits[0].noise, level * found.form[axis], level * OF_SMOOTH)
+        weights = _weights(sets, beside, fits[0].noise, level * found.form[axis], level * OF_SMOOTH)
         named = [
             (names, one.drivers, w, one)
             for w, one in zip(weights, sets, strict=True)
@@ -130,7 +143,7 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     verdict = judge(explanations, explanations, of_classes=True)
     best, hidden, doubted = by_members[verdict.chosen.best.members], None, False
     probability = verdict.probability
-    if verdict.outside and not holds(problem, verdict.chosen.best):
+    if verdict.outside and not holds(problem, verdict.chosen.best, beside):
         probability = min(probability, _UNCONFIRMED)
     most = _CLEARLY**2 * fits[0].rss
     if not best.members and not verdict.outside and best.rss > most:
@@ -148,22 +161,22 @@ def _after_nuisance(nothing: Fit, noise: float) -> float:
     return float(nothing.grams.yy - xy @ torch.linalg.solve(inner, xy))
 
 
-def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float) -> list[float]:
-    """Log posterior of each set under noise and form errors, not normalised.
+def _weights(sets: Sequence[Candidate], nuisance: int, noise: float, form: float, smooth: float) -> list[float]:
+    """Log posterior of each set under noise and form errors, not normalised; nuisance: how many columns it has.
 
     What follows a driver is smooth where its cause need not be: beside one, where that is the best, a name has to do
     more than that share of what the driver does.
     """
 
     def under(variance: float) -> list[float]:
-        evidence = evidences([(one.grams, one.groups) for one in sets], variance)
+        evidence = weighed(side_by_side(sets), nuisance, [one.groups for one in sets], variance).log_evidence.tolist()
         return [found + one.log_prior for found, one in zip(evidence, sets, strict=True)]
 
     weights = under(noise + form)
     best = sets[weights.index(max(weights))]
     if best.rows is None:
         return weights
-    does = float(fit_sets(best.grams, [best.groups], 0.0).energy[0, len(best.groups) - 1])
+    does = float(weighed(best.grams, nuisance, [best.groups], None).energy[0, len(best.groups) - 1])
     smeared = under(noise + form + smooth * does)
     least = torch.tensor([0.0 if one.rows is not None else -math.inf for one in sets], dtype=torch.float64)
     whole, beside = (torch.logsumexp(torch.tensor(w, dtype=torch.float64) + least, 0) for w in (weights, smeared))
@@ -222,7 +235,7 @@ def essential(members: Members, left: Mapping[Members, float], unseen: Mapping[M
 def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapping[Members, Fit]) -> list[Candidate]:
     """Drivers beside the most probable sets, and those that lead from the best one to none."""
     problem, plainly = found.problem, white_noise(len(found.problem.axes))
-    mine, values = torch.tensor([axis]), float(problem.judged.sum())
+    mine, values = torch.tensor([axis]), problem.values
     white, plain = (
         [problem.whitened(d.columns[axis], mine.expand(len(d.columns[axis])), whitening) for d in drivers]
         for whitening in (found.whitening, plainly)
@@ -251,10 +264,11 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
         prior = prior_of(base) + OUTSIDE + crowd(count + 1) - crowd(count)
         for k, (driver, beside) in enumerate(zip(drivers, white, strict=True)):
             x = torch.cat([own, beside])
-            grams = products(x, found.nuisance[axis], y, values)
+            grams = products(found.nuisance[axis], x, y, values)
             groups = [*base.spec.groups, torch.arange(len(own), len(x))]
             sets.append((k, Candidate(base.members, (driver.name,), grams, groups, prior, (own, beside, y))))
-    means = fit_sets(side_by_side([one.grams for _, one in sets]), [one.groups for _, one in sets], 0.0).mean
+    each = [one for _, one in sets]
+    means = weighed(side_by_side(each), found.nuisance.shape[1], [one.groups for one in each], None).mean
     for n, (k, one) in enumerate(sets):
         b = n // len(drivers)
         m = len(places[b])
@@ -267,13 +281,16 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     return [one._replace(members=essential(one.members, taken[k] if one.drivers else left, {})) for k, one in sets]
 
 
-def holds(problem: Problem, candidate: Candidate) -> bool:
-    """Whether a driver takes something away on runs that no fit saw; the scales are those of all runs."""
+def holds(problem: Problem, candidate: Candidate, nuisance: int) -> bool:
+    """Whether a driver takes something away on runs that no fit saw; the scales are those of all runs.
+
+    nuisance: how many columns it has.
+    """
     assert candidate.rows is not None
     own, columns, y = candidate.rows
     fold = problem.fold[:, None].expand(problem.judged.shape).flatten()
     less, more = (
-        float(squares_unseen(x[None], y[None], fit_sets(candidate.grams, [groups], 0.0), [groups], fold))
+        float(squares_unseen(x[None], y[None], weighed(candidate.grams, nuisance, [groups], None), [groups], fold))
         for x, groups in ((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))
     )
     return more < less
@@ -299,7 +316,7 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
     step = data.time.diff(dim=-1).clamp_min(1e-9)
     speed = _slope(moved, step)
     acceleration = _slope(speed, step)
-    error = problem.followed - moved
+    error = problem.driven.followed - moved
     # An axis that follows exactly has no torque, and what rounding leaves of it has the sign of the speed.
     span = (data.position.amax((-1, -2)) - data.position.amin((-1, -2)))[:, None, None, None]
     loaded = error.abs().amax((-1, -2))[:, None, None, None] > _LOADED * span
@@ -317,8 +334,9 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
     }
     # Friction comes and goes with the place, the time and the temperature as well.
     pushed = [("speed", fast), ("position", place), ("position", place * sign), ("time", over * sign)]
-    if float(problem.warm.abs().max()) >= _WARMER:
-        warm = (problem.warm / problem.warm.abs().max()).expand(len(moved), -1, -1)[:, None]
+    warmest = problem.driven.warm.abs().max()
+    if float(warmest) >= _WARMER:
+        warm = (problem.driven.warm / warmest).expand(len(moved), -1, -1)[:, None]
         pushed.append(("temperature", warm * sign))
         direct["temperature"] = warm
     found = [Driver(name, _SIZE * span * columns) for name, columns in direct.items()]
@@ -335,17 +353,12 @@ def _slope(values: Tensor, step: Tensor) -> Tensor:
 
 def _hats(driver: Tensor, judged: Tensor, is_even: bool = False) -> Tensor:
     """Piecewise linear functions, `n x m x b x s`, with their knots at quantiles, or evenly spaced."""
-    share = (
-        torch.linspace(0, 1, _EVENLY, dtype=driver.dtype)
-        if is_even
-        else torch.linspace(*_ENDS, _KNOTS, dtype=driver.dtype)
-    )
+    share = torch.linspace(*((0, 1, _EVENLY) if is_even else (*_ENDS, _KNOTS)), dtype=driver.dtype)
     found = driver.new_zeros(len(driver), len(share), *driver.shape[1:])
     for hats, one in zip(found, driver, strict=True):
         some = one[judged]
-        few = some[:: max(len(some) // 10_000, 1)]
         even = some.min() + share * (some.max() - some.min())
-        knots = torch.unique(even if is_even else torch.quantile(few, share))
+        knots = torch.unique(even if is_even else torch.quantile(some, share))
         if len(knots) > 2:
             place = (torch.searchsorted(knots, one.contiguous()) - 1).clamp(0, len(knots) - 2)
             within = ((one - knots[place]) / (knots[place + 1] - knots[place])).clamp(0, 1)
@@ -374,4 +387,4 @@ def _over_time(problem: Problem) -> Tensor:
         mine = data.run == run
         ends = data.time[mine][data.judged[mine]]
         share[mine] = ((data.time[mine] - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)).clamp(0, 1)
-    return _hats(share[None], data.judged, True).expand(len(problem.followed), -1, -1, -1)
+    return _hats(share[None], data.judged, True).expand(len(problem.axes), -1, -1, -1)

@@ -87,7 +87,7 @@ def _settled(
             tried = {n: about[n] + (v - about[n]) / 2**k for n, v in wanted.items()}
             driven = nominal.driven(logs, problem.data, tried)
             library = problem.library._replace(about=tried)
-            nearer = replace(problem, library=library, followed=driven.followed, own=driven.own)
+            nearer = replace(problem, library=library, driven=driven)
             if _left(nearer, specs, tried) < now:
                 break
         else:

@@ -13,6 +13,7 @@ from torch import Tensor
 from ccnn_torch.motion.descent import sensitivities
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
+from ccnn_torch.motion.nominal import Driven
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.spec import Fit
@@ -173,15 +174,8 @@ def _problem_of(problem: Problem, axis: int, proposed: Sequence[Motion]) -> Prob
         problem,
         data=data,
         library=library._replace(facts=(), numbers=(library.numbers[axis],) * count, nominal=nominal, changes=changes),
-        followed=command,
-        supply=still,
-        warm=still,
+        driven=Driven(command, still, still),
         unit=problem.unit[axis].expand(count),
-        torque=None,
-        carried=None,
-        simulated=None,
-        there=None,
-        own={},
         pool=max(round(step / _STEP), 1),
     )
 

@@ -28,14 +28,18 @@ class Driven(NamedTuple):
     """What drives the axes, `n x b x s` each.
 
     Attributes:
-        followed: positions that they follow [rad or m].
+        followed: positions that they follow [rad or m]: the commands, or what a simulator makes of them.
+        supply, warm: as of `Drive`, `b x s`.
         torque: what resists their motors on the measured motion, over the gain [rad or m]; None = nothing.
         simulated: positions of the nominal model; None where the nominal axes tell them.
         there: what resists the motors on that motion, as `torque`.
-        own, carried: as of `Problem`.
+        own: what a unit of each of a simulator's own parameters changes in its positions, by name.
+        carried: what 1 kg at the tool adds to `torque` [rad or m per kg].
     """
 
     followed: Tensor
+    supply: Tensor
+    warm: Tensor
     torque: Tensor | None = None
     simulated: Tensor | None = None
     there: Tensor | None = None
@@ -106,11 +110,18 @@ class Nominal:
         Raises:
             InputError: the simulator fails.
         """
-        simulator = self.simulator
+        simulator, supply, warm = self.simulator, torch.zeros_like(data.time), torch.zeros_like(data.time)
+        if "supply" in data.beside:
+            volts = data.beside["supply"]
+            usual = self.supply or float(volts[data.judged].median())
+            supply = volts / usual - 1 if usual else supply
+        if "temperature" in data.beside:
+            warm = data.beside["temperature"] - data.beside["temperature"][data.judged].min()
+        found = Driven(data.command, supply, warm)
         if self.loaded is not None:
             made_of = [self.loaded(log.time, log.command, log.position) for log in logs]
             simulated, there, torque, carried = (_along([one[k] for one in made_of], data) for k in range(4))
-            return Driven(data.command, torque, simulated, there, carried=carried)
+            return found._replace(torque=torque, simulated=simulated, there=there, carried=carried)
         if simulator is not None:
             centre = {name: value + (about or {}).get(name, 0.0) for name, value in simulator.parameters.items()}
 
@@ -123,8 +134,8 @@ class Nominal:
                 step = _STEP * (abs(value) or 1.0)
                 own[name] = (made_with(**{name: value + step}) - made_with(**{name: value - step})) / (2 * step)
                 made = made - (value - simulator.parameters[name]) * own[name]
-            return Driven(made, own=own)
-        return Driven(data.command)
+            return found._replace(followed=made, own=own)
+        return found
 
 
 def _along(made: Sequence[Array], data: Stretches) -> Tensor:

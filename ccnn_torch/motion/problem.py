@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,12 +16,14 @@ from ccnn_torch.motion.effects.bodies import CARRIED
 from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.known import OF, TIME, share_of
 from ccnn_torch.motion.library import Library
+from ccnn_torch.motion.nominal import Driven
 from ccnn_torch.motion.stage import ABSENT
-from ccnn_torch.motion.stretches import START, Stretches
+from ccnn_torch.motion.stretches import Stretches
 from ccnn_torch.motion.whiten import Whitening
+from ccnn_torch.numerics.trees import below, mapped
 
-# Of an axis that ran away: no residual is larger, in units of the motion.
-_FARTHEST = 10.0
+# Of an axis that ran away: no residual is larger, in thousandths of the motion.
+_FARTHEST = 1e4
 
 
 @dataclass(frozen=True)
@@ -31,56 +33,34 @@ class Problem:
     Attributes:
         data: `n` joints, `b` stretches, `s` samples.
         library: effects.
-        followed: what the axes follow, `n x b x s`: the commands, or what a simulator makes of them.
-        torque, simulated, there: as of `Driven`.
-        supply, warm: as of `Drive`, `b x s`.
+        driven: what drives the axes.
         unit: of whitened residuals, about a thousandth of the motion of each axis, so that no least number is one of
             rad or m; a power of two, which rounds nothing; `n` [rad or m].
-        own: what a unit of each of a simulator's own parameters changes in its positions, by name, `n x b x s`.
         parted: whether folds are parts of the runs, where these could be folds.
         known: shares to which values of the nominal model and time stamps are known, as of `shares_of`.
-        carried: what 1 kg at the tool adds to `torque`, `n x b x s` [rad or m per kg].
         pool: so many samples are averaged before they are judged: what is faster than the motion is noise.
     """
 
     data: Stretches
     library: Library
-    followed: Tensor
-    supply: Tensor
-    warm: Tensor
+    driven: Driven
     unit: Tensor
     pool: int = 1
-    torque: Tensor | None = None
-    simulated: Tensor | None = None
-    there: Tensor | None = None
-    own: Mapping[str, Tensor] = field(default_factory=dict)
-    carried: Tensor | None = None
     parted: bool = False
     known: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def axes(self) -> Tensor:
         """The number of each axis, `n`."""
-        return torch.arange(len(self.followed))
+        return torch.arange(len(self.unit))
 
     def of(self, rows: Tensor) -> Problem:
         """The same of some stretches."""
 
-        def some(values: Tensor | None, dim: int = 1) -> Any:
-            return None if values is None else values.index_select(dim, rows)
+        def some(values: Tensor) -> Tensor:
+            return values.index_select(max(values.dim() - 2, 0), rows)
 
-        data = self.data
-        return replace(
-            self,
-            data=data._replace(
-                **{n: some(getattr(data, n)) for n in ("command", "position", "speed", "begin")},
-                **{n: some(getattr(data, n), 0) for n in ("time", "judged", "run", "log", "bent")},
-                beside={name: some(v, 0) for name, v in data.beside.items()},
-            ),
-            **{n: some(getattr(self, n)) for n in ("followed", "torque", "simulated", "there", "carried")},
-            **{n: some(getattr(self, n), 0) for n in ("supply", "warm")},
-            own={name: some(v) for name, v in self.own.items()},
-        )
+        return replace(self, data=mapped(some, self.data), driven=mapped(some, self.driven))
 
     @cached_property
     def _start(self) -> Tensor:
@@ -89,36 +69,34 @@ class Problem:
         if data.begin is None:
             faster = (data.speed[:, :, 2] - v) / (data.time[:, 2] - data.time[:, 0])
             return torch.stack([q, v, faster], -1)
-        start = torch.cat([torch.stack([q, v], -1), data.begin], -1)
-        if self.torque is not None:
-            # That of the first stretch of each run.
-            start[..., START.index("torque")] = self.torque[:, torch.searchsorted(data.run, data.run), 0]
-        return start
+        return torch.cat([torch.stack([q, v], -1), data.begin], -1)
 
-    def positions(self, theta: Tensor, axis: Tensor, chosen: Tensor | None = None) -> Tensor:
+    def positions(self, theta: Tensor, axis: Tensor) -> Tensor:
         """Simulated positions of models of axes.
 
         Args:
             theta: numbers of each model, `p x k`.
             axis: which axis each is of, `p`.
-            chosen: stretches, all when None.
 
         Returns:
             `p x b x s` [rad or m].
         """
-        rows = torch.arange(len(self.data.time)) if chosen is None else chosen
-        moved = self._moved(theta, axis, rows)
-        return moved if self.simulated is None else moved + self._beyond[axis][:, rows]
+        moved = self._moved(theta, axis)
+        return moved if self.driven.simulated is None else moved + self._beyond[axis]
 
     @cached_property
     def _beyond(self) -> Tensor:
         """What a simulator makes of the commands less what its axes make of them, `n x b x s`."""
-        assert self.simulated is not None
-        begin, rows = self.simulated[..., :2], torch.arange(len(self.data.time))
-        speed = begin.diff(dim=-1) / self.data.time[:, :2].diff(dim=-1)
-        theta = torch.zeros(len(begin), self.library.size, dtype=torch.float64)
-        start = torch.cat([begin[..., :1], speed], -1)
-        return self.simulated - replace(self, torque=self.there)._moved(theta, self.axes, rows, start)
+        simulated = self.driven.simulated
+        assert simulated is not None
+        speed = simulated[..., :2].diff(dim=-1) / self.data.time[:, :2].diff(dim=-1)
+        start, there = torch.cat([simulated[..., :1], speed], -1), self.driven._replace(torque=self.driven.there)
+        return simulated - replace(self, driven=there)._moved(self.nothing, self.axes, start)
+
+    @property
+    def nothing(self) -> Tensor:
+        """Numbers of the nominal model of every axis, `n x k`."""
+        return torch.zeros(len(self.unit), self.library.size, dtype=torch.float64)
 
     def pushed(self, theta: Tensor, torque: Tensor) -> Tensor:
         """Positions under torques that resist the motors, over the gain, one after the other.
@@ -131,22 +109,22 @@ class Problem:
             `n x m x b x s`.
         """
         n, m, b, s = torque.shape
-        every = torque if self.torque is None else torque + self.torque[:, None]
+        own = self.driven
+        every = (torque if own.torque is None else torque + own.torque[:, None]).reshape(n, m * b, s)
         # A stretch, and a run, for every torque.
         wide = self.of(torch.arange(b).repeat(m))
         run = wide.data.run + (int(wide.data.run.max()) + 1) * torch.arange(m).repeat_interleave(b)
-        wide = replace(wide, data=wide.data._replace(run=run), torque=every.reshape(n, m * b, s), simulated=None)
-        moved = wide.positions(theta, self.axes).reshape(n, m, b, s)
-        return moved if self.simulated is None else moved + self._beyond[:, None]
+        data, driven = wide.data._replace(run=run), wide.driven._replace(torque=every)
+        moved = replace(wide, data=data.under(every), driven=driven)._moved(theta, self.axes).reshape(n, m, b, s)
+        return moved if own.simulated is None else moved + self._beyond[:, None]
 
     def nuisance(self, theta: Tensor) -> Tensor:
         """What the positions change by when a nominal parameter is off by what it is known to, `k x n x b x s`.
 
         About `theta`, `n x k`, the machine as it seems to be: a model that is wrong may be near to its stability.
         """
-        rows, nominal = torch.arange(len(self.data.time)), self.library.nominal
-        plain, columns = self._moved(theta, self.axes, rows), []
-        absent = torch.zeros(len(self.followed), dtype=torch.float64)
+        nominal, absent = self.library.nominal, torch.zeros_like(self.unit)
+        plain, columns = self._moved(theta, self.axes), []
         for key, share in self.unsure.items():
             # The direction of a weight is known as well as its size.
             size = torch.hypot(*(nominal.get(name, absent) for name in OF["mass"])) if key == "mass" else None
@@ -154,7 +132,7 @@ class Problem:
                 before = nominal.get(name, absent + ABSENT[name])
                 moved = before + share * (before if size is None else size)
                 other = self.library._replace(nominal={**nominal, name: moved})
-                columns.append(replace(self, library=other)._moved(theta, self.axes, rows) - plain)
+                columns.append(replace(self, library=other)._moved(theta, self.axes) - plain)
         return torch.stack([*columns, self.stamped])
 
     @property
@@ -175,43 +153,38 @@ class Problem:
     @cached_property
     def _drive(self) -> Drive:
         """All axes in all stretches, one axis after the other."""
-        data, start = self.data, self._start
-        torque = None if self.torque is None else self.torque.flatten(0, 1)
+        data, own = self.data, self.driven
+        torque = None if own.torque is None else own.torque.flatten(0, 1)
         usual = data.time.diff(dim=-1).median(-1).values
-        command, begin = self.followed.flatten(0, 1), start.flatten(0, 1)
-        return Drive(data.time, command, begin, self.supply, self.warm, torque, data.bent, usual)
+        command, begin = own.followed.flatten(0, 1), self._start.flatten(0, 1)
+        return Drive(data.time, command, begin, own.supply, own.warm, torque, data.bent, usual)
 
-    def _moved(self, theta: Tensor, axis: Tensor, rows: Tensor, start: Tensor | None = None) -> Tensor:
+    def _moved(self, theta: Tensor, axis: Tensor, start: Tensor | None = None) -> Tensor:
         """As `positions`, without what a simulator adds; start: as of `Drive`, of every axis and stretch."""
-        drive, which = self._drive, axis[:, None] * len(self.data.time) + rows
+        drive, which = self._drive, axis[:, None] * len(self.data.time) + torch.arange(len(self.data.time))
         if start is not None:
             drive = drive._replace(start=start.flatten(0, 1))
         parameters = self.library.parameters(theta, axis)
-        own, mass = {name: parameters.pop(f"{OWN}{name}", None) for name in self.own}, parameters.pop(CARRIED, None)
-        if mass is not None and self.carried is not None:
-            load = mass[:, None, None] * self.carried[axis[:, None], rows]
-            torque = load if self.torque is None else load + self.torque[axis[:, None], rows]
+        own, mass = below(parameters, OWN), parameters.get(CARRIED)
+        if mass is not None and self.driven.carried is not None:
+            torque = mass[:, None, None] * self.driven.carried[axis]
+            if self.driven.torque is not None:
+                torque = torque + self.driven.torque[axis]
             # Each model has runs of its own then.
             at = {name: v[which.flatten() % len(v)] for name, v in drive._asdict().items() if v is not None}
             drive = drive._replace(**at | {"torque": torque.flatten(0, 1)})
             which = torch.arange(which.numel()).reshape(which.shape)
         moved = simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
-        for name, value in own.items():
-            if value is not None:
-                moved = moved + value[:, None, None] * self.own[name][axis[:, None], rows]
+        for name, makes in self.driven.own.items():
+            if name in own:
+                moved = moved + own[name][:, None, None] * makes[axis]
         return moved
 
-    def residual(self, theta: Tensor, axis: Tensor, chosen: Tensor | None = None) -> Tensor:
+    def residual(self, theta: Tensor, axis: Tensor) -> Tensor:
         """Measured less simulated, as `positions`; finite."""
-        measured = self.data.position[axis] if chosen is None else self.data.position[axis[:, None], chosen]
-        far, left = self._far[axis, None, None], measured.sub_(self.positions(theta, axis, chosen))
+        far, left = _FARTHEST * self.unit[axis, None, None], self.data.position[axis].sub_(self.positions(theta, axis))
         # What is no number is far away.
-        return torch.fmax(torch.fmin(left, far, out=left), -far, out=left)
-
-    @cached_property
-    def _far(self) -> Tensor:
-        measured = self.data.position
-        return _FARTHEST * (measured.amax((-1, -2)) - measured.amin((-1, -2))) + 1e-12
+        return left.nan_to_num_(nan=math.inf).clamp_(-far, far)
 
     def pooled(self, residual: Tensor) -> Tensor:
         """Means over `pool` samples each, `... x s` -> `... x t`."""
@@ -246,7 +219,11 @@ class Problem:
         """Which of the means count, `b x t`."""
         return self.pooled(self.data.judged.double()) == 1
 
-    def whitened(self, residual: Tensor, axis: Tensor, whitening: Whitening, chosen: Tensor | None = None) -> Tensor:
+    @property
+    def values(self) -> float:
+        """How many of them count."""
+        return float(self.judged.sum())
+
+    def whitened(self, residual: Tensor, axis: Tensor, whitening: Whitening) -> Tensor:
         """Whitened means of residuals `p x b x s` of the axes `p` in `unit`, `p x (b t)`; 0 where they do not count."""
-        judged = self.judged if chosen is None else self.judged[chosen]
-        return whitening(self.pooled(residual), axis).mul_(judged / self.unit[axis, None, None]).flatten(1)
+        return whitening(self.pooled(residual), axis).mul_(self.judged / self.unit[axis, None, None]).flatten(1)

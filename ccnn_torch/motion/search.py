@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.priors import EFFECT, crowd
-from ccnn_torch.motion.descent import sensitivities
-from ccnn_torch.motion.fit import evidences, fit_many, form_errors, products, unseen_errors, weighed
+from ccnn_torch.motion.descent import sensitivities, white_residual
+from ccnn_torch.motion.fit import fit_many, form_errors, products, side_by_side, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.servo import TORQUES
@@ -70,7 +70,7 @@ def log_posterior(fit: Fit) -> float:
 
 def search(problem: Problem) -> Search:
     """Find the probable sets of every axis."""
-    n, count = len(problem.followed), len(problem.data.run)
+    n, count = len(problem.axes), len(problem.data.run)
     # Sets are looked for in some of the stretches, and fitted to all.
     fewest, few = (
         problem.of(torch.linspace(0, count - 1, some).round().long()) if count > some else problem
@@ -95,7 +95,7 @@ def search(problem: Problem) -> Search:
         final.fit(likely, _LONG)
     final.reduced()
     unseen = final.weigh_forms()
-    form = form_errors(problem, final.whitening, final.tied(), unseen)
+    form = form_errors(problem, final.whitening, final.nuisance, final.tied(), unseen)
     final.variance = None
     final.reduced()
     return Search(
@@ -114,8 +114,8 @@ class _Pool:
     def __init__(self, problem: Problem, whitening: Whitening, about: Tensor | None = None) -> None:
         self.problem, self.whitening = problem, whitening
         # Nothing, as long as each set has the noise that it leaves.
-        self.axes = len(problem.followed)
-        nuisance = problem.followed.new_zeros(0, *problem.followed.shape) if about is None else problem.nuisance(about)
+        self.axes, followed = len(problem.axes), problem.driven.followed
+        nuisance = followed.new_zeros(0, *followed.shape) if about is None else problem.nuisance(about)
         white = problem.whitened(nuisance.flatten(0, 1), problem.axes.repeat(len(nuisance)), whitening)
         self.nuisance = white.reshape(len(nuisance), self.axes, white.shape[-1]).transpose(0, 1)
         self.library: Library = problem.library
@@ -152,8 +152,8 @@ class _Pool:
             fit for fit in fits if variance is not None and old.get((variance, fit.members), (0.0, None))[1] is not fit
         ]
         if variance is not None and new:
-            weighed_new = evidences([(fit.grams, fit.spec.groups) for fit in new], variance)
-            for fit, evidence in zip(new, weighed_new, strict=True):
+            weighed_new = weighed(side_by_side(new), self.nuisance.shape[1], [f.spec.groups for f in new], variance)
+            for fit, evidence in zip(new, weighed_new.log_evidence.tolist(), strict=True):
                 old[variance, fit.members] = evidence + log_posterior(fit) - fit.log_evidence, fit
         found = [(log_posterior(fit), fit) if variance is None else old[variance, fit.members] for fit in fits]
         return sorted(found, key=lambda one: (-_level(one[0]), one[1].members))
@@ -238,7 +238,7 @@ class _Pool:
         ranked = self.ranked()
         unseen = unseen_errors([fits[:_KEPT] for fits in ranked])
         for _ in range(2):
-            form = form_errors(self.problem, self.whitening, self.tied(), unseen)
+            form = form_errors(self.problem, self.whitening, self.nuisance, self.tied(), unseen)
             self.variance = [own[0].noise + more for own, more in zip(ranked, form, strict=True)]
         return unseen
 
@@ -381,19 +381,19 @@ def promises(
     if not moved:
         return [[] for _ in bases]
     at = torch.tensor(rows)
-    left = problem.whitened(problem.residual(torch.stack(moved), axis[at]), axis[at], whitening)
+    left = white_residual(problem, whitening, torch.stack(moved), axis[at])
     new = (residual[at] - left) / left.new_tensor(steps)[:, None]
     found = []
     for b, (i, fit) in enumerate(bases):
         flat = list(fit.spec.flat)
         x = torch.cat([own[b, : len(flat)], new[at == b]])
-        grams = products(x, nuisance[i], residual[b] + theta[b, flat] @ x[: len(flat)], float(problem.judged.sum()))
+        grams = products(nuisance[i], x, residual[b] + theta[b, flat] @ x[: len(flat)], problem.values)
         widths = torch.tensor([len(v.active) for v in variants[b]], dtype=torch.int64)
         ends = (widths.cumsum(0) + len(flat)).tolist()
         sets = [
             [*fit.spec.groups, torch.arange(end - len(v.active), end)] for v, end in zip(variants[b], ends, strict=True)
         ]
-        scores = weighed(grams, sets, len(x), variances[b]).log_evidence.tolist() if sets else []
+        scores = weighed(grams, len(nuisance[i]), sets, variances[b]).log_evidence.tolist() if sets else []
         found.append(
             [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, variants[b], strict=True)]
         )

@@ -20,7 +20,7 @@ from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.nominal import Driven, Nominal, own_simulator
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.servo import servo
-from ccnn_torch.motion.stretches import Stretches, cut_stretches, direction
+from ccnn_torch.motion.stretches import Stretches, cut_stretches, direction, nearly_largest
 from ccnn_torch.plugins import is_plugin
 
 # Seconds over which samples are averaged before they are judged.
@@ -29,8 +29,6 @@ _POOLED = 0.02
 _HIGHEST, _RIPPLES = 200.0, 4
 # Median sizes at which what is left of the torque is clipped.
 _CLIPPED = 3.0
-# Quantile of what counts as nearly the largest.
-_NEARLY = 0.98
 
 
 def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEffect]) -> Problem:
@@ -41,14 +39,9 @@ def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEf
     """
     data = cut_stretches(logs)
     driven = nominal.driven(logs, data)
-    supply = torch.zeros_like(data.time)
-    if "supply" in data.beside:
-        usual = nominal.supply or float(data.beside["supply"][data.judged].median())
-        supply = data.beside["supply"] / usual - 1 if usual else supply
-    warm = torch.zeros_like(data.time)
-    if "temperature" in data.beside:
-        warm = data.beside["temperature"] - data.beside["temperature"][data.judged].min()
-    facts = [_facts(data, i, nominal, driven, supply, warm) for i in range(len(data.units))]
+    if driven.torque is not None:
+        data = data.under(driven.torque)
+    facts = [_facts(data, i, nominal, driven) for i in range(len(data.units))]
     library = library_of(effects, facts)
     if all(library.lacking):
         need = "; ".join(f"{name} needs {why}" for name, why in zip(library.names, library.lacking, strict=True))
@@ -56,31 +49,26 @@ def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEf
     span = data.position.amax((-1, -2)) - data.position.amin((-1, -2))
     unit = torch.exp2((1e-3 * span).clamp_min(1e-12).log2().round())
     pool = max(round(_POOLED / float(data.time.diff(dim=-1).median())), 1)
-    own = driven._asdict()
-    return Problem(data, library, pool=pool, supply=supply, warm=warm, unit=unit, known=nominal.known, **own)
+    return Problem(data, library, driven, unit, pool, known=nominal.known)
 
 
-def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Tensor, warm: Tensor) -> Facts:
+def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven) -> Facts:
     judged = data.judged
-
-    def nearly(values: Tensor) -> float:
-        kept = values.abs().flatten()
-        return float(torch.quantile(kept[:: max(len(kept) // 100_000, 1)], _NEARLY))
 
     span = float(data.command[i][judged].max() - data.command[i][judged].min())
     # Between runs other things than the temperature change as well.
-    runs = [warm[data.run == run][judged[data.run == run]] for run in set(data.run.tolist())]
+    runs = [driven.warm[data.run == run][judged[data.run == run]] for run in set(data.run.tolist())]
     return Facts(
         unit=data.units[i],
         nominal=nominal.axes[i],
         gain=nominal.gains[i],
         length=nominal.lengths[i],
-        carried=None if driven.carried is None else nearly(driven.carried[i][judged]),
+        carried=None if driven.carried is None else float(nearly_largest(driven.carried[i][judged])),
         heaviest=nominal.heaviest,
         span=span or 1.0,
-        speed=nearly(data.speed[i][judged]) or 1.0,
-        error=nearly((driven.followed[i] - data.position[i])[judged]) or 1e-6,
-        supply=float(supply[judged].abs().max()) if "supply" in data.beside else 0.0,
+        speed=float(nearly_largest(data.speed[i][judged])) or 1.0,
+        error=float(nearly_largest((driven.followed[i] - data.position[i])[judged])) or 1e-6,
+        supply=float(driven.supply[judged].abs().max()) if "supply" in data.beside else 0.0,
         temperature=max(float(v.max() - v.min()) for v in runs),
         ripples=_ripples(data.position[i], driven.followed[i], data.time, judged, nominal.axes[i]),
     )

@@ -34,7 +34,7 @@ _AHEAD = (1 - GAMMA) / GAMMA
 
 class Given(NamedTuple):
     """Parameters of axes: angles in rad (m of a sliding axis), s, 1; the values are those of one that follows its
-    command."""
+    command. Of `has` true where some axis has another value; what none has is left out, which changes nothing."""
 
     gain: Any = 1.0
     integral: Any = 0.0
@@ -129,24 +129,6 @@ class Axis(NamedTuple):
     light: Array
 
 
-class Has(NamedTuple):
-    """What axes have, true or false, or arrays of it; what none has is left out, which changes nothing."""
-
-    integral: Any
-    dry: Any
-    load_friction: Any
-    stribeck: Any
-    heavy: Any
-    waves: Any
-    soft: Any
-    weak: Any
-    slow: Any
-    led: Any
-    dead: Any
-    play: Any
-    hung: Any
-
-
 class State(NamedTuple):
     """Position and speed of the motor, and of the load where it hangs on a spring; torque of the integral action."""
 
@@ -196,6 +178,13 @@ class Sample(NamedTuple):
     pushed: Array
     supply: Array
     warm: Array
+
+
+@compilable
+def within(value: Array, most: Array | float) -> Array:
+    """The value, its size limited."""
+    found: Array = np.minimum(np.maximum(value, -most), most)
+    return found
 
 
 @compilable
@@ -251,26 +240,6 @@ def axis_of(a: Given) -> Axis:
 
 
 @compilable
-def each_has(axis: Axis) -> Has:
-    """What each of the axes has."""
-    return Has(
-        integral=axis.integral != 0,
-        dry=(axis.coulomb != 0) | (axis.load_friction != 0) | (axis.stribeck != 0),
-        load_friction=axis.load_friction != 0,
-        stribeck=axis.stribeck != 0,
-        heavy=axis.weight != 0,
-        waves=axis.wave != 0,
-        soft=axis.flexibility > 0,
-        weak=axis.limit < 1 / TINY,
-        slow=(axis.slowness > 0) | (axis.ramp > 0),
-        led=axis.derivative != 0,
-        dead=axis.dead_band > 0,
-        play=axis.play > 0,
-        hung=(axis.play > 0) & (axis.play_loaded > 0),
-    )
-
-
-@compilable
 def begun(axis: Axis, start: Array, push: Array) -> State:
     """The state of axes that begin as `start` says (see `Drive`): a spring carries the load's weight, and the integral
     action held what the command did not when the log began."""
@@ -286,18 +255,19 @@ def begun(axis: Axis, start: Array, push: Array) -> State:
     held = 1 - np.exp(-_STOOD * axis.integral)
     held = held * (load + start[15] - axis.gain * ((1 + axis.ratio) * start[13] + axis.offset - start[14]))
     held = held + axis.gain * axis.integral * added
-    held = pick(axis.integral > 0, np.minimum(np.maximum(held, -axis.limit), axis.limit), 0.0 * q)
+    held = pick(axis.integral > 0, within(held, axis.limit), 0.0 * q)
     at_motor = axis.at_motor > 0
     return State(pick(at_motor, q, q + sag), v, pick(at_motor, q - sag, q), v, held)
 
 
 @compilable
-def advanced(axis: Axis, has: Has, state: State, given: Sample, parts: int) -> State:
+def advanced(axis: Axis, has: Given, state: State, given: Sample, parts: int) -> State:
     """The state at the next sample, in so many parts."""
     fixed = _fixed(axis, has, given, parts)
-    slope, risen = (given.after - given.before) / parts, given.pushed - given.push
+    share, risen = 1.0 / parts, given.pushed - given.push
+    slope = (given.after - given.before) * share
     for i in range(parts):
-        before, first, last = given.before + i * slope, (i + GAMMA) / parts, (i + 1.0) / parts
+        before, first, last = given.before + i * slope, (i + GAMMA) * share, (i + 1.0) * share
         asked = before + GAMMA * slope + first * (1 - first) * given.bend
         middle = _stage(axis, has, fixed, state, asked, given.push + first * risen)
         between = State(
@@ -313,13 +283,13 @@ def advanced(axis: Axis, has: Has, state: State, given: Sample, parts: int) -> S
 
 
 @compilable
-def _fixed(axis: Axis, has: Has, given: Sample, parts: int) -> _Fixed:
+def _fixed(axis: Axis, has: Given, given: Sample, parts: int) -> _Fixed:
     """What all stages of a sample have in common."""
     h, strength = given.step * (GAMMA / parts), np.maximum(1 + axis.supply * given.supply, 0.0)
     dry = axis.coulomb * np.maximum(1 + axis.thermal * given.warm, 0.0)
     gain, limit, mass = axis.gain * strength, axis.limit * strength, axis.inertia / h
     light, over, drag, follows = mass + axis.viscous, h, h, h
-    if has.soft:
+    if has.flexibility:
         over, drag = axis.flexibility / h, h + axis.drag
         follows = drag / (over + drag)
         light = light + axis.stiffness * drag * (1 - follows)
@@ -329,33 +299,33 @@ def _fixed(axis: Axis, has: Has, given: Sample, parts: int) -> _Fixed:
 
 
 @compilable
-def _pulling(axis: Axis, has: Has, q: Array, push: Array) -> Array:
+def _pulling(axis: Axis, has: Given, q: Array, push: Array) -> Array:
     """Torque of the weight and of the other joints at a position."""
-    if has.heavy:
+    if has.gravity_sin or has.gravity_cos:
         return axis.weight * np.sin(q + axis.hang) + push
     return push
 
 
 @compilable
-def _error(axis: Axis, has: Has, error: Array) -> Array:
+def _error(axis: Axis, has: Given, error: Array) -> Array:
     """What the drive makes of an error: nothing within its dead band."""
-    if has.dead:
-        return error - np.minimum(np.maximum(error, -axis.dead_band), axis.dead_band)
+    if has.dead_band:
+        return error - within(error, axis.dead_band)
     return error
 
 
 @compilable
-def _stage(axis: Axis, has: Has, fixed: _Fixed, state: State, u: Array, push: Array) -> State:
+def _stage(axis: Axis, has: Given, fixed: _Fixed, state: State, u: Array, push: Array) -> State:
     """The state at the end of a stage."""
     h, limit, q, v, x, w, held = fixed.h, fixed.limit, state.q, state.v, state.x, state.w, state.held
     motor, stiff = fixed.gain * _error(axis, has, u - q) + held, fixed.stiff
-    if has.dead:
+    if has.dead_band:
         # Within it nothing resists; an axis without a mass goes on as if something did.
         stiff = pick((np.abs(u - q) < axis.dead_band) & (fixed.mass > 0), 0.0 * stiff, stiff)
     # What the gear carries beside the motor's torque.
     carried = _pulling(axis, has, q, push)
     against, loose = carried, q
-    if has.soft:
+    if has.flexibility:
         apart, pulled = q - x, _pulling(axis, has, x, push)
         # The load's speed at the end of the stage is this and `follows` times the motor's.
         loose = (fixed.over * w + apart - axis.slack * pulled) / (fixed.over + fixed.drag)
@@ -363,7 +333,7 @@ def _stage(axis: Axis, has: Has, fixed: _Fixed, state: State, u: Array, push: Ar
         against = pick(axis.hung > 0, axis.stiffness * (apart - fixed.drag * loose), against)
     free = fixed.mass * v - against
     light = fixed.light
-    if has.waves:
+    if has.cogging_sin or has.cogging_cos:
         # Linearised, and no steeper than a stage can follow, the less so the more of a wave it passes without a mass:
         # else the last digit would decide where it goes.
         passed = np.square(axis.order * h * v)
@@ -377,27 +347,27 @@ def _stage(axis: Axis, has: Has, fixed: _Fixed, state: State, u: Array, push: Ar
         least = _STEEPEST * axis.stribeck / (_STEEP * (light - fixed.mass + stiff) + fixed.mass)
         friction = friction + axis.stribeck * np.exp(-np.square(v / np.maximum(axis.stribeck_speed, least)))
     speed = _solved(axis, has, free, motor, friction, carried, light, stiff)
-    if has.weak:
+    if has.weakness:
         # The part of the damping that the drive makes is within its limit, which falls with the speed.
         torque = motor - (stiff + axis.drive_damping - axis.line) * speed
-        most = np.minimum(np.maximum(torque, -limit), limit)
+        most = within(torque, limit)
         lighter = np.maximum(light - axis.drive_damping + axis.line, TINY)
         weak = _solved(axis, has, free, most, friction, carried, lighter, 0.0 * most)
         speed = pick(torque == most, speed, weak)
-    speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)
+    speed = within(speed, _FASTEST)
     end = q + h * speed
-    if has.soft:
-        w = np.minimum(np.maximum(loose + fixed.follows * speed, -_FASTEST), _FASTEST)
+    if has.flexibility:
+        w = within(loose + fixed.follows * speed, _FASTEST)
         x = x + h * w
     if has.integral:
         # Beyond the limit of the motor it stands still (anti-windup).
-        held = np.minimum(np.maximum(held + fixed.rate * h * _error(axis, has, u - end), -limit), limit)
+        held = within(held + fixed.rate * h * _error(axis, has, u - end), limit)
     return State(end, speed, x, w, held)
 
 
 @compilable
 def _solved(
-    axis: Axis, has: Has, free: Array, motor: Array, friction: Array, carried: Array, light: Array, stiff: Array
+    axis: Axis, has: Given, free: Array, motor: Array, friction: Array, carried: Array, light: Array, stiff: Array
 ) -> Array:
     """Speed under all torques against dry friction; stiff: how fast the motor's falls with it."""
     resistance, push = light + stiff, free + motor
@@ -405,8 +375,8 @@ def _solved(
         load = motor + carried
         friction = friction + axis.load_friction * np.abs(load)
         resistance = resistance - axis.load_friction * stiff * np.sign(push * load)
-    if has.dry:
-        push = push - np.minimum(np.maximum(push, -friction), friction)
+    if has.coulomb or has.load_friction or has.stribeck:
+        push = push - within(push, friction)
     return push / resistance
 
 

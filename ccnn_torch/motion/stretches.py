@@ -76,6 +76,14 @@ class Stretches(NamedTuple):
     begin: Tensor | None
     bent: Tensor | None = None
 
+    def under(self, torque: Tensor) -> Stretches:
+        """With what resists the motors, `n x b x s`, at the first sample of the first stretch of each run."""
+        if self.begin is None:
+            return self
+        begin = self.begin.clone()
+        begin[..., START.index("torque") - 2] = torque[:, torch.searchsorted(self.run, self.run), 0]
+        return self._replace(begin=begin)
+
 
 def cut_stretches(logs: Sequence[Log]) -> Stretches:
     """Cut logs of one machine into stretches.
@@ -215,9 +223,16 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
     )
 
 
+def nearly_largest(values: Tensor) -> Tensor:
+    """Of sizes `… x s`."""
+    return torch.quantile(values.abs(), _NEARLY, dim=-1)
+
+
 PHASES = ("standstill", "reversal", "fast", "slow")
 # Shares of nearly the largest speed.
 _STILL, _FAST = 0.03, 0.5
+# Quantile of what counts as nearly the largest.
+_NEARLY = 0.98
 # Seconds before and after a change of direction.
 _AROUND = 0.15
 
@@ -225,7 +240,7 @@ _AROUND = 0.15
 def phases_of(data: Stretches) -> Tensor:
     """Phase of each sample of each joint by its measured speed, an index of `PHASES`, `n x b x s`."""
     speed, width = data.speed, 2 * int(_AROUND / data.time.diff(dim=-1).median()) + 1
-    most = torch.quantile(speed[:, data.judged].abs()[:, :100_000], 0.98, dim=-1)[:, None, None]
+    most = nearly_largest(speed[:, data.judged])[:, None, None]
     moving = speed.abs() > _STILL * most
     sign = torch.sign(speed) * moving
     # The last direction in which it moved, so that a stop between two directions is a reversal too.

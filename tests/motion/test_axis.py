@@ -33,12 +33,10 @@ OWN = {"inertia": INERTIA / GAIN, "viscous": VISCOUS / GAIN}
     "real",
     [
         {},
-        {"weight": 0.3},
         {"delay": 0.03},
         {"dry": 0.1},
         {"limit": 0.12, "drive": 0.05},
         {"integral": 3.0, "weight": 0.3},
-        {"derivative": 0.02, "limit": 0.2},
         {"derivative": 0.03, "integral": 5.0, "dry": 0.02},
         {"band": 0.03, "integral": 3.0},
     ],

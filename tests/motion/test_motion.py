@@ -47,7 +47,7 @@ def test_what_no_motion_separates_is_a_class(tmp_path: Path) -> None:
 
 
 def test_a_drift_of_the_encoder_is_outside_the_library(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0, 1))
+    log = write_log(tmp_path / "log.csv", (0, 1), 3.0)
     header, *rows = log.read_text().splitlines()
     cells = [row.split(",") for row in rows]
     lines = [f"{t},{r},{u},{float(q) + 0.03 * np.sin(0.9 * float(t)):.17g}" for t, r, u, q in cells]
@@ -79,7 +79,7 @@ def test_the_command_on_a_real_servo(tmp_path: Path, cli: Cli) -> None:
 
 
 def test_neither_rounding_nor_the_order_of_effects_decides_a_verdict_on_a_real_servo() -> None:
-    logs = load_logs([DATA / f"servo_{name}.csv" for name in ("sin_sin", "up_and_down")])
+    logs = load_logs([DATA / "servo_sin_sin.csv"])
     nominal, said, ripples = nominal_of("servo", {}, ["rad"]), [], []
     for seed in (0, 1):
         signs = np.random.default_rng(seed).choice([-1, 0, 1], len(logs[0].time))
@@ -97,14 +97,20 @@ def test_neither_rounding_nor_the_order_of_effects_decides_a_verdict_on_a_real_s
 
 def test_nothing_is_named_that_makes_runs_worse_which_it_was_not_fitted_to(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.csv", (0, 1), 2.4, delay=0.03)
-    problem = problem_of(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), motion_effects(["delay"]))
+    problem = problem_of(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), motion_effects(["delay", "offset"]))
     found = search(problem)
     verdicts = judge_axes(found)
     assert [found.problem.library.names[m] for m in verdicts[0].best.members] == ["delay"]
-    before = problem.residual(torch.zeros(1, problem.library.size, dtype=torch.float64), problem.axes)
-    assert no_worse(found, verdicts, before, 0.99 * before) == (verdicts, [])
-    kept, worse = no_worse(found, verdicts, before, 1.01 * before)
-    assert worse == [0] and kept[0].best.members == () and kept[0].probability <= 0.5
+    before = problem.residual(problem.nothing, problem.axes)
+    assert no_worse(found, verdicts, (0,), torch.stack([before, 0.99 * before])) == (verdicts, {})
+    kept, fewer = no_worse(found, verdicts, (0,), torch.stack([before, 1.01 * before]))
+    assert fewer == {0: 0} and kept[0].best.members == () and kept[0].probability <= 0.5
+    # Name by name: of two the second one alone makes it worse.
+    both = next(fit for fit in found.found[0] if fit.members == (0, 1))
+    two = [verdicts[0]._replace(best=both, classes={0: (), 1: ()})]
+    kept, fewer = no_worse(found, two, (0, 1), torch.stack([before, 0.5 * before, 0.6 * before]))
+    assert fewer == {0: 1} and kept[0].best.members == (0,) and kept[0].classes == {0: ()}
+    assert no_worse(found, two, (0, 1), torch.stack([before, 0.5 * before, 0.4 * before])) == (two, {})
 
 
 def test_a_mechanism_file_gives_joints_that_follow_their_commands(tmp_path: Path) -> None:
@@ -400,7 +406,7 @@ def test_a_gain_is_told_as_a_share_of_that_of_the_model(tmp_path: Path) -> None:
 
 
 def test_a_dead_band_of_the_drive_is_named_and_is_no_friction(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0, 2), 4.0, band=0.02)
+    log = write_log(tmp_path / "log.csv", (0, 2), 3.0, band=0.02)
     tried = ["dead_band", "coulomb", "backlash", "viscous", "delay"]
     found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), tried).content
     assert found["verdict"]["effects"] == ["dead_band"] and found["verdict"]["probability"] > 0.9

@@ -213,8 +213,8 @@ class Stiff:
 
     @staticmethod
     def simulate(time: np.ndarray, commands: np.ndarray, given: dict[str, float]) -> np.ndarray:
-        step = (time[-1] - time[0]) / (4 * (len(time) - 1))
-        clock = time[0] + step * np.arange(4 * len(time))
+        step = (time[-1] - time[0]) / (2 * (len(time) - 1))
+        clock = time[0] + step * np.arange(2 * len(time))
         q, v, found = float(commands[0, 0]), 0.0, np.empty(len(clock))
         for k, u in enumerate(np.interp(clock, time, commands[:, 0]).tolist()):
             found[k] = q
