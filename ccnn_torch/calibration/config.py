@@ -20,7 +20,6 @@ from ccnn_torch.config.tree import (
     Section,
 )
 from ccnn_torch.effects import EFFECTS
-from ccnn_torch.engine import Engine
 from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.gp import GPSettings
@@ -145,22 +144,11 @@ class RunConfig(JobConfig):
         description=f"learners: a list of {', '.join(LEARNERS)}; all = these; auto = the best of auto.methods "
         "by cross-validation; null = ccnn, and where geometry=auto compared a learner, what that comparison prefers",
     )
-    engine: Engine = Field(
-        default="local",
-        description="where blocks of repeats run: local, processes, dask (a cluster on this machine), or a scheduler's "
-        "address, tcp://HOST:8786",
-    )
-    block: int | None = Field(
-        default=None,
-        ge=1,
-        description="repeats of one job, a run of its own in blocks/; null = with engine=local as many as "
-        "max_bytes hold, else 1",
-    )
     max_bytes: int | None = Field(
         default=None,
         ge=1,
-        description="memory in bytes that a run may take; more repeats than it holds run in blocks, one by one, and "
-        "no step of a training takes more; null = a quarter of what is free, and 128 MiB for a step",
+        description="memory in bytes that a run may take; what takes more is refused, and no step of a training takes "
+        "more; null = what is free, and 128 MiB for a step",
     )
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
     covariates: Names | None = Field(
