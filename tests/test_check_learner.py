@@ -39,7 +39,6 @@ FACTORIES: dict[str, Callable[[], Learner]] = {
                 **SMALL,
                 "generations": 4,
                 "refinement_iterations": 2,
-                "refine_every": 2,
                 "members": 2,
                 "rival_hidden": (2,),
                 "waves": 4,

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
-
-import torch
 
 from ccnn_torch.calibration.dataset import Dataset
 from ccnn_torch.calibration.early_stop import Choice, Plan, WatchPhase, choose
 from ccnn_torch.calibration.statistics import spread
-from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners import Learner
-from ccnn_torch.report.json_files import plain, read_json, write_json
 from ccnn_torch.report.results.run import Auto, Compared
 from ccnn_torch.run_folder.folder import RunFolder
 
@@ -112,32 +106,24 @@ def compare(
 ) -> Comparison:
     """Cross-validate one method after the other while budget is left.
 
-    What is decided is written to `auto.json` in the run folder after each method, and read back when the run is
-    resumed: how far a budget reaches differs from run to run, and a resumed run must end as it would have.
+    A resumed run decides as it would have: the checkpoint of each method has the seconds that it took.
 
     Args:
         makers: what makes the learner of each method, in the order to try them.
         budget: seconds inside the learners, for all methods together.
-        folder: where checkpoints and decisions go; None = nowhere.
+        folder: where checkpoints go; None = nowhere.
 
     Raises:
-        InputError: `auto.json` is damaged.
         MethodFailedError: no method could be compared: they failed, or the budget was too small.
     """
     comparison = Comparison(budget, plan.folds)
-    if folder is not None and folder.auto.is_file():
-        _read(folder, comparison)
     for name, make in makers.items():
-        if name in comparison.compared or name in comparison.skipped:
-            continue
         found = _judge(name, make, dataset, plan, comparison, folder, watch)
         if isinstance(found, Choice):
             comparison.compared[name] = found
             comparison.spent += found.seconds
         else:
             comparison.skipped[name] = found
-        if folder is not None:
-            _write(folder, comparison)
     if not comparison.compared:
         raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in comparison.skipped.items()))
     return comparison
@@ -167,43 +153,3 @@ def _judge(
         comparison.spent = budget
         return f"the budget of {budget:g} s was spent before its first step"
     return choice
-
-
-# What of a `Choice` is written, and of which type its tensors are.
-_TENSORS = {
-    "best_step": torch.int64,
-    "errors": torch.float64,
-    "sd_scale": torch.float64,
-    "converged": torch.bool,
-    "evaluations": torch.float64,
-}
-_NUMBERS = ("step", "seconds", "ended")
-
-
-def _write(folder: RunFolder, comparison: Comparison) -> None:
-    compared = {
-        name: {key: getattr(choice, key) for key in (*_TENSORS, *_NUMBERS)}
-        for name, choice in comparison.compared.items()
-    }
-    decided = {"compared": compared, "skipped": comparison.skipped, "spent": comparison.spent}
-    write_json(folder.auto, {**decided, "sha256": _seal(decided)})
-
-
-def _read(folder: RunFolder, comparison: Comparison) -> None:
-    found = read_json(folder.auto)
-    try:
-        if found.pop("sha256") != _seal(found):
-            raise ValueError("was altered")
-        for name, entry in found["compared"].items():
-            fields: dict[str, Any] = {key: entry[key] for key in _NUMBERS}
-            for key, kind in _TENSORS.items():
-                fields[key] = None if entry[key] is None else torch.tensor(entry[key], dtype=kind)
-            comparison.compared[name] = Choice(**fields)
-        comparison.skipped |= found["skipped"]
-        comparison.spent = float(found["spent"])
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise InputError(f"{folder.auto} is damaged; delete it and resume, which compares the methods again") from None
-
-
-def _seal(decided: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(plain(decided), sort_keys=True).encode()).hexdigest()

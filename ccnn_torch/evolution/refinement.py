@@ -25,27 +25,11 @@ from ccnn_torch.evolution.gauss_newton import Network, linearise, network_of, pr
 from ccnn_torch.evolution.waves import Waves
 from ccnn_torch.numerics.trees import chosen, picked, put
 
-# Calm iterations after which a network is done.
-_CALM = 3
-
-
-@dataclass(frozen=True)
-class RefinementSettings:
-    """How to refine.
-
-    Attributes:
-        iterations: Levenberg-Marquardt iterations.
-        warm_up: iterations before the first estimate of the precisions.
-        tolerance: a network whose objective falls by less than this share in each of three iterations running is done;
-            0 = the objective ends none.
-        patience: iterations without a rise of the log evidence by 1 nat after which a network is done; it ends with
-            the weights and precisions of the highest evidence.
-    """
-
-    iterations: int = 50
-    warm_up: int = 3
-    tolerance: float = 1e-5
-    patience: int = 6
+# A network whose objective falls by less than this share in so many iterations running is done, and one whose log
+# evidence has not risen by 1 nat for so many: it ends with the weights and precisions of the highest evidence.
+_TOLERANCE, _CALM, _PATIENCE = 1e-5, 3, 6
+WARM_UP = 3
+"""Iterations before the first estimate of the precisions."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +46,7 @@ class RefinementProblem:
         leading: the leading dimensions as given.
         group_count: number of prior groups, that last one included.
         wave_groups: which of them are of periodic nodes, int64.
-        settings: as given.
+        warm_up: iterations before the first estimate of the precisions.
     """
 
     network: Network
@@ -74,7 +58,7 @@ class RefinementProblem:
     leading: tuple[int, ...]
     group_count: int
     wave_groups: Tensor
-    settings: RefinementSettings
+    warm_up: int
 
 
 @dataclass(frozen=True)
@@ -198,10 +182,11 @@ def refine(
     inputs: Tensor,
     targets: Tensor,
     row_weights: Tensor,
-    settings: RefinementSettings | None = None,
+    iterations: int = 50,
     row_metric: Tensor | None = None,
     waves: Waves | None = None,
     known: Precisions | None = None,
+    warm_up: int = WARM_UP,
 ) -> Refined:
     """Refine the weights of masked sigmoid networks with linear output; masks stay as they are.
 
@@ -214,7 +199,7 @@ def refine(
         inputs: `... x s x i`, about in [-1, 1].
         targets: `... x s x o`, of about unit deviation.
         row_weights: `... x s`; 0 leaves a row out, even with NaN.
-        settings: defaults where None.
+        iterations: Levenberg-Marquardt iterations, at most.
         row_metric: `... x s x c x o`: the residual of a row is this matrix times (output - target), so that errors
             are judged in other channels than the outputs' own, as the pose error that joint deviations cause.
         waves: periodic nodes `... x k`, whose columns are last in the output's mask and weights; their frequencies
@@ -223,21 +208,19 @@ def refine(
 
     Leading dimensions of all arguments broadcast against each other.
     """
-    settings = settings or RefinementSettings()
-    if known is not None:
-        settings = replace(settings, warm_up=0)
-    problem = pose_refinement(masks, weights, inputs, targets, row_weights, settings, row_metric, waves)
+    warm_up = warm_up if known is None else 0
+    problem = pose_refinement(masks, weights, inputs, targets, row_weights, row_metric, waves, warm_up)
     state = best = start = start_refinement(problem, weights, waves, known)
     highest = torch.full_like(state.damping, -torch.inf)
     stale = torch.zeros_like(state.calm)
-    for _ in range(problem.settings.iterations):
-        going = torch.nonzero(~state.done & (stale < problem.settings.patience)).flatten()
+    for _ in range(iterations):
+        going = torch.nonzero(~state.done & (stale < _PATIENCE)).flatten()
         if len(going) == 0:
             break
         # Networks do not know of each other, so that those which are done need not be worked on for the others' sake.
         part, now = part_of_problem(problem, going), picked(state, going)
         local = second_order(part, now)
-        if int(state.iteration) > problem.settings.warm_up:
+        if int(state.iteration) > warm_up:
             evidence = log_evidence(part, now, local)
             risen = evidence > highest[going]
             best = put(best, going, chosen(risen, now, picked(best, going)))
@@ -261,9 +244,9 @@ def pose_refinement(
     inputs: Tensor,
     targets: Tensor,
     row_weights: Tensor,
-    settings: RefinementSettings | None = None,
     row_metric: Tensor | None = None,
     waves: Waves | None = None,
+    warm_up: int = WARM_UP,
 ) -> RefinementProblem:
     """The fixed part of a refinement; arguments as in `refine`."""
     metrics = [] if row_metric is None else [row_metric.shape[:-3]]
@@ -275,7 +258,6 @@ def pose_refinement(
         row_weights.shape[:-1],
         *metrics,
     )
-    settings = settings or RefinementSettings()
     rows = _flatten(row_weights, leading, 1)
     there = rows > 0
     bias = weights[0].shape[-1] == masks[0].shape[-1] + 1
@@ -298,7 +280,7 @@ def pose_refinement(
         leading=leading,
         group_count=int(groups.max()) + (1 if bias or slots else 2),
         wave_groups=wave_groups(int(groups.max()), masks[-1].shape[-2], slots),
-        settings=settings,
+        warm_up=warm_up,
     )
 
 
@@ -373,10 +355,10 @@ def step_refinement(
         state,
         weights=weights,
         damping=damping.clamp(*_DAMPING_RANGE),
-        calm=torch.where(before - reached < problem.settings.tolerance * before, state.calm + 1, 0),
+        calm=torch.where(before - reached < _TOLERANCE * before, state.calm + 1, 0),
         iteration=state.iteration + 1,
     )
-    if int(moved.iteration) <= problem.settings.warm_up:
+    if int(moved.iteration) <= problem.warm_up:
         return moved
     return _estimate_precisions(problem, moved, known)
 

@@ -35,13 +35,10 @@ class CCNNSettings:
             predict better with a third to a half of the connections than with all, on a UR10 and on simulated
             machines (0.35 and 0.5 were compared there; 0.4 is between).
         bias: whether nodes have a bias, an input that is always on; the paper's strings have none.
-        target_error: end once the training error of eq. 11 (standardised) of every repeat is at most this; 0 = never.
         members: independent coevolutions of each repeat (paper: 1).
         kept: with refinement, the members of highest evidence that get periodic nodes and are averaged, into one masked
             network with their hidden layers side by side. All six did better than three on most tuning machines, and
             their intervals held more often what they should.
-        refine_every: generations between refinements of the best joined network that are written back into the elite;
-            0 = only one, after the last generation.
         waves: slots for periodic nodes, each a sine and a cosine of one input found in what the refined network leaves,
             since gears and screws repeat their errors; 0 = none (paper: none). They need refinement.
         wave_searches: how often to look for them, each time followed by a refinement.
@@ -68,10 +65,8 @@ class CCNNSettings:
     weight_range: float = 2.0
     density: float = 0.4
     bias: bool = True
-    target_error: float = 0.0
     members: int = 6
     kept: int = 6
-    refine_every: int = 0
     waves: int = 32
     wave_searches: int = 3
     harmonics: int = 96
@@ -83,7 +78,7 @@ class CCNNSettings:
             object.__setattr__(self, key, None if layers is None else tuple(layers))
         if self.rival_hidden is not None and not all(width >= 1 for width in self.rival_hidden):
             raise ValueError(f"rival_hidden={list(self.rival_hidden)}: every hidden layer needs at least one node")
-        check_least(self, members=1, kept=1, refine_every=0, refinement_iterations=0)
+        check_least(self, members=1, kept=1, refinement_iterations=0)
         check_least(self, waves=0, wave_searches=0, harmonics=0)
         _check(self)
 
@@ -113,7 +108,6 @@ class ENNSettings:
         density: share of connections that exist at the start. With nothing to learn, 0.2 costs less than 0.5 (1.02 to
             1.05 of the constant's error), and where there is something it makes no difference.
         bias: whether nodes have a bias, an input that is always on.
-        target_error: end once the training error of eq. 11 (standardised) of every repeat is at most this; 0 = never.
 
     Raises:
         ValueError: a value out of its range, in one sentence with the key.
@@ -129,7 +123,6 @@ class ENNSettings:
     weight_range: float = 2.0
     density: float = 0.2
     bias: bool = True
-    target_error: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
@@ -156,8 +149,6 @@ def _check(settings: EvolutionSettings) -> None:
             raise ValueError(f"{key}={getattr(settings, key)} is a probability: write a number from 0 to 1")
     if not settings.weight_range > 0:
         raise ValueError(f"weight_range={settings.weight_range} must be above 0")
-    if not settings.target_error >= 0:
-        raise ValueError(f"target_error={settings.target_error} must not be negative")
 
 
 def check_least(settings: Any, **least: float) -> None:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.refinement import (
-    RefinementSettings,
     RefinementState,
     log_evidence,
     part_of_problem,
@@ -99,7 +98,6 @@ class BPLM(OneNetwork):
             data.inputs.unsqueeze(1),
             data.targets.unsqueeze(1),
             data.weights.unsqueeze(1),
-            RefinementSettings(iterations=self.settings.iterations),
             None if data.metric is None else data.metric.unsqueeze(1),
         )
         self._state = start_refinement(self._problem, weights)

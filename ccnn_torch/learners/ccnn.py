@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.coevolution import EPSILON, REPRESENTATIVES, density, diversity, make_task
+from ccnn_torch.evolution.coevolution import REPRESENTATIVES, density, diversity, make_task
 from ccnn_torch.evolution.masked_network import MaskedNetwork, Spread, readout_spread, spread_variance
 from ccnn_torch.evolution.network import averaged, forward, without_waves
 from ccnn_torch.evolution.random import member_seeds
@@ -103,7 +103,7 @@ class CCNN:
 
     @property
     def finished(self) -> bool:
-        """True after the last generation (or once every coevolution has reached the target error) and refinement."""
+        """True after the last generation and refinement."""
         return self._evolved and self._phase >= self._phases
 
     @property
@@ -201,11 +201,7 @@ class CCNN:
 
     @property
     def _evolved(self) -> bool:
-        settings = self.settings
-        states = [structure.state for structure in self._structures]
-        errors = torch.stack([1 / state.best_fitness - EPSILON for state in states])
-        reached = settings.target_error > 0 and bool((errors <= settings.target_error).all())
-        return reached or states[0].generation >= settings.generations
+        return self._structures[0].state.generation >= self.settings.generations
 
     @property
     def _phases_each(self) -> int:

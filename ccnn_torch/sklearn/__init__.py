@@ -273,7 +273,6 @@ class CCNNRegressor(SteppedRegressor):
         population: individuals of each subpopulation, one a layer.
         generations: steps.
         members: independent coevolutions, whose networks are averaged.
-        refine_every: generations between refinements; 0 = only after the last.
         refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
         waves: slots for periodic nodes, found in what a refined network leaves; 0 = none, as in the paper.
         wave_searches: how often to look for them.
@@ -308,7 +307,6 @@ class CCNNRegressor(SteppedRegressor):
     population: int = 40
     generations: int = 10
     members: int = 2
-    refine_every: int = 0
     refinement_iterations: int = 20
     waves: int = CCNNSettings.waves
     wave_searches: int = CCNNSettings.wave_searches

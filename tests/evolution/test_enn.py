@@ -121,12 +121,6 @@ def test_it_learns_a_smooth_function() -> None:
     assert bool(((variance > residual) & (variance < 3 * residual)).all())
 
 
-def test_it_ends_at_the_target_error() -> None:
-    history = history_of(ENN(replace(SMALL, target_error=1.2)), toy_data([1]))
-    assert len(history) < SMALL.generations
-    assert float(1 / history[-1]["fitness_best"]) <= 1.2 + 1e-5
-
-
 @pytest.mark.parametrize(
     ("keys", "sentence"),
     [

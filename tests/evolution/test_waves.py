@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.gauss_newton import dense_jacobian, linearise, network_of, residual
+from ccnn_torch.evolution.gauss_newton import linearise, network_of, residual
 from ccnn_torch.evolution.refinement import Refined, refine
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves, wave_signal
@@ -75,12 +75,10 @@ def test_the_jacobian_has_frequencies_and_amplitudes() -> None:
     weights = torch.randn(2, 4 * 4 + 2 * 11, generator=generator, dtype=torch.float64)
     flat = torch.cat([weights, waves.frequency], -1)
     inputs, targets = uniform_rows(2, 12, 4), uniform_rows(2, 12, 2, seed=1)
-    found = dense_jacobian(network, flat, inputs, targets)
     expected = torch.autograd.functional.jacobian(lambda w: residual(network, w, inputs, targets, None), flat)
     expected = torch.stack([expected[k, :, :, k] for k in range(2)]) * network.active[:, None, None]
-    assert torch.allclose(found, expected, rtol=1e-9, atol=1e-12)
     local = linearise(network, flat, inputs, targets, None, torch.ones(2, 12, 2, dtype=torch.float64))
-    found = found.gather(-1, network.kept_flat[:, None, None].expand(-1, 12, 2, -1))
+    found = expected.gather(-1, network.kept_flat[:, None, None].expand(-1, 12, 2, -1))
     assert torch.allclose(local.matrix, torch.einsum("bsck,bscl->bkl", found, found), rtol=1e-9, atol=1e-12)
 
 
