@@ -25,7 +25,7 @@ from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.learners.registry import LEARNERS
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 
 
 def _one(value: Any) -> Any:
@@ -119,9 +119,8 @@ class AutoConfig(_Part):
 def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
     for method in methods:
         if method not in choices and ".py:" not in method:
-            near = nearest(method, choices)
-            hint = f"did you mean '{near}'?" if near else f"known are {', '.join(choices)} and file.py:Name"
-            raise ValueError(f"there is no method '{method}'; {hint}")
+            near = hint(method, choices, "known are", " and file.py:Name")
+            raise ValueError(f"there is no method '{method}'; {near}")
         if methods.count(method) > 1:
             raise ValueError(f"'{method}' is given twice")
     return methods
@@ -258,9 +257,8 @@ class RunConfig(JobConfig):
             return effects
         for name in effects:
             if name not in EFFECTS:
-                near = nearest(name, tuple(EFFECTS))
-                hint = f"did you mean '{near}'?" if near else f"known are {', '.join(EFFECTS)}"
-                raise ValueError(f"there is no effect '{name}' that a model file can hold; {hint}")
+                near = hint(name, tuple(EFFECTS), "known are")
+                raise ValueError(f"there is no effect '{name}' that a model file can hold; {near}")
         return effects or "none"
 
     @model_validator(mode="after")

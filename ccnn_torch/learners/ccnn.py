@@ -138,21 +138,10 @@ class CCNN:
     def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`.
 
-        Its periodic nodes are left out; `waves` has them.
+        Its periodic nodes are left out.
         """
         plain = averaged(without_waves(self._structure(repeat).members()))
         return [mask[repeat] for mask in plain.masks], [weight[repeat] for weight in plain.weights]
-
-    def waves(self, repeat: int) -> list[tuple[int, float, Tensor]]:
-        """Periodic nodes of one repeat's model: input, frequency [rad per unit of the feature], amplitudes `o` [1]."""
-        model = self._structure(repeat).members()
-        slots, readout = model.slots, model.weights[-1][repeat]
-        end = model.masks[-1].shape[-1]
-        sines, cosines = readout[..., end - 2 * slots : end - slots], readout[..., end - slots : end]
-        amplitude = torch.hypot(sines, cosines).mean(0)
-        frequency = model.waves.frequency[repeat].mean(0)
-        used = torch.nonzero(frequency).flatten().tolist()
-        return [(int(model.waves.source[repeat, 0, k]), float(frequency[k]), amplitude[:, k]) for k in used]
 
     def network(self, repeat: int) -> MaskedNetwork:
         """The model of one repeat, pruned of its dead nodes."""

@@ -416,7 +416,6 @@ class GRNNRegressor(LearnerRegressor):
     Args:
         iterations: steps of the search at most; it ends earlier once its moves are small.
         candidates: bandwidth vectors judged in one step.
-        narrowest, widest: range of bandwidths that the first step searches; inputs are scaled to -1 .. 1.
         queries: rows that leave-one-out judges, drawn where there are more.
         references: rows that they are predicted from, drawn where there are more.
         periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine.
@@ -437,7 +436,5 @@ class GRNNRegressor(LearnerRegressor):
 
     iterations: int = GRNNSettings.iterations
     candidates: int = GRNNSettings.candidates
-    narrowest: float = GRNNSettings.narrowest
-    widest: float = GRNNSettings.widest
     queries: int = GRNNSettings.queries
     references: int = GRNNSettings.references

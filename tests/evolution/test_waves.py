@@ -102,9 +102,7 @@ def test_ccnn_learns_a_gear_that_sigmoids_cannot() -> None:
             learner.step()
         errors[waves] = float((learner.predict(fresh.inputs) - truth).square().mean())
     assert errors[0] > 0.1 and errors[4] < 0.005
-    (source, frequency, amplitude), *_ = learner.waves(0)
-    assert source == 0 and frequency == pytest.approx(23.7, abs=0.1)
-    assert amplitude.tolist() == pytest.approx([1.0, 0.0], abs=0.05)
+    assert float(learner.network(0).frequencies[0, 0]) == pytest.approx(23.7, abs=0.1)
     # The exported network has the nodes too, and the variance of its output layer.
     module = learner.network(1)
     assert len(module.frequencies) > 0
@@ -144,8 +142,7 @@ def test_angles_are_read_by_waves_alone() -> None:
     learner.start(data)
     while not learner.finished:
         learner.step()
-    source, frequency, _ = learner.waves(0)[0]
-    assert (source, round(frequency)) == (2, 36)
+    assert learner.network(0).frequencies.round().tolist()[0] == [0, 0, 36]
     assert learner.genome(0)[0][0].shape[-1] == 2
     assert torch.allclose(learner.network(0)(inputs[0]), learner.predict(inputs)[0], rtol=0, atol=1e-12)
     assert float((learner.predict(inputs) - targets).square().mean()) < 0.01

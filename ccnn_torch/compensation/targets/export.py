@@ -26,7 +26,7 @@ from ccnn_torch.display import plain
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 from ccnn_torch.version import __version__
 
 DTYPES = ("float64", "float32")
@@ -174,9 +174,7 @@ def export_model(
     """
     for value, known, what in ((to, [*TARGETS], "target"), (dtype, DTYPES, "dtype")):
         if value not in known:
-            near = nearest(value, known)
-            hint = f" (did you mean '{near}'?)" if near else ""
-            raise InputError(f"there is no {what} '{value}'{hint}; there are {', '.join(known)}")
+            raise InputError(f"there is no {what} '{value}'; {hint(value, known)}")
     if current is not None and to not in CURRENT:
         raise InputError(f"--current: is read by the targets {', '.join(CURRENT)}, not by {to}; leave it out")
     model = load_compensation(path, public_key=public_key, allow_code=allow_code)
