@@ -19,7 +19,7 @@ from toy import Descent
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.dataset import Dataset
 from ccnn_torch.calibration.early_stop import Plan
-from ccnn_torch.calibration.method_choice import Comparison, compare
+from ccnn_torch.calibration.fitting import Comparison, compare
 from ccnn_torch.calibration.page import run_page
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners.constant import Constant

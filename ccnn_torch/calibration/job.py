@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -25,9 +26,9 @@ from ccnn_torch.errors import MethodFailedError, WriteError
 from ccnn_torch.mechanisms import Instrument
 from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.plugins import is_plugin
-from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
+from ccnn_torch.report.arrays import ARRAYS_FILE, RunArrays, load_arrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
-from ccnn_torch.report.results.run import ModelFiles
+from ccnn_torch.report.results.run import ModelFiles, RunResults
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, resume_hint
 from ccnn_torch.run_folder.resume import FolderJob, check_fingerprint, fingerprint
@@ -99,13 +100,37 @@ def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     for method, history in curves.items():
         save_history(path, method, history)
     if calibration.config.save_report:
-        # Loads matplotlib, which a run without pictures does not wait for.
-        from ccnn_torch.calibration.figures import write_report
-
         write_report(path, results)
     else:
         write_tables(path, results)
     write_json(folder.results, results)
+
+
+_LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "config.yaml")
+
+
+def write_report(folder: Path, results: RunResults) -> Path:
+    """Write `results.csv`, `results.md`, `plots/` and `report.html` of a run folder; returns the path of the page.
+
+    Reads `arrays.safetensors` where it is there; the same files give the same report, so it can be written again.
+
+    Args:
+        results: the content of its `results.json`.
+    """
+    # Loads matplotlib, which a run without pictures does not wait for.
+    from ccnn_torch.report.figures import inline_figures, joint_error_plot, pose_error_plot, workspace_plot
+    from ccnn_torch.report.machine import machine_plot
+
+    write_tables(folder, results)
+    plots = []
+    if (folder / ARRAYS_FILE).is_file():
+        arrays = load_arrays(folder)
+        words = "With " + " + ".join([*results.pose.parts, arrays.labels.get("method", "the model")])
+        # What mostly turns has no places to draw errors at, but a map of its angles.
+        plots = [machine_plot(arrays.drawn, words) or workspace_plot(arrays)]
+        plots += [pose_error_plot(arrays), joint_error_plot(arrays)]
+    figures = inline_figures([plot for plot in plots if plot is not None], folder / "plots")
+    return run_page(results, figures, Path(folder.name)).write_html(folder / "report.html", _LINKED)
 
 
 def _save_models(calibration: Calibration, folder: RunFolder) -> ModelFiles:

@@ -16,8 +16,14 @@ from torch import Tensor
 from ccnn_torch.calibration.choice import ModelChoice, choose_model
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.dataset import Dataset, by_repeat, dataset_of
-from ccnn_torch.calibration.effects_search import search_effects, without_frame_drift
-from ccnn_torch.calibration.physics import Physics, fit_physics, frames_of_repeats, verdict_of
+from ccnn_torch.calibration.physics import (
+    Physics,
+    fit_physics,
+    frames_of_repeats,
+    search_effects,
+    verdict_of,
+    without_frame_drift,
+)
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict

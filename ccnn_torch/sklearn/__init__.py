@@ -19,7 +19,7 @@ from sklearn.utils import check_array, check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 from torch import Tensor, nn
 
-from ccnn_torch.calibration.uncertainty import sd_scale
+from ccnn_torch.calibration.statistics import sd_scale
 from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings

@@ -18,7 +18,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ccnn_torch.calibration.callbacks import EventFile, TensorBoardCallback, tags_of
-from ccnn_torch.calibration.figures import write_report
+from ccnn_torch.calibration.job import write_report
 from ccnn_torch.calibration.page import long_table, pays, result_tables, run_page, verdict, worse_text
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
@@ -40,10 +40,10 @@ def test_the_report_folder(report_folder: Path) -> None:
 
 def test_a_folder_with_numbers_only_still_gets_its_tables(tmp_path: Path) -> None:
     write_json(tmp_path / "results.json", arm_run()[0])
-    page = write_report(tmp_path).read_text()
+    page = write_report(tmp_path, RunResults.read(tmp_path / "results.json")).read_text()
     assert "<svg" not in page and "µrad" in page and "held-out rows, 4 not trained on" in page
     with pytest.raises(InputError, match=r"results\.json: there is no such file"):
-        write_report(tmp_path / "plots")
+        RunResults.read(tmp_path / "plots" / "results.json")
 
 
 class Page(HTMLParser):

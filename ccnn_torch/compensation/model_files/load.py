@@ -335,7 +335,7 @@ class LoadedModel:
             return np.array([[edge["low"], edge["high"]] for edge in edges])
         measured = self.machine.joints
         if not len(measured):
-            from ccnn_torch.compensation.parts import all_over
+            from ccnn_torch.compensation.fit import all_over
 
             joints = all_over(self.machine.nominal).joints
             fine = joints[torch.isfinite(joints).all(-1)]

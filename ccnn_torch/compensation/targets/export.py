@@ -18,8 +18,15 @@ from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
 from ccnn_torch.compensation.targets.lowered import Found, Stack, with_readme
 from ccnn_torch.compensation.targets.machines import print_hal, print_klipper
 from ccnn_torch.compensation.targets.onnx_export import export_onnx
-from ccnn_torch.compensation.targets.robots import print_lerobot, print_pal, print_robot, print_ur
-from ccnn_torch.compensation.targets.ros2_control import middle_of, offsets_alone, print_ros2_control
+from ccnn_torch.compensation.targets.robots import (
+    middle_of,
+    offsets_alone,
+    print_lerobot,
+    print_pal,
+    print_robot,
+    print_ros2_control,
+    print_ur,
+)
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.display import plain
