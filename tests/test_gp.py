@@ -329,7 +329,7 @@ def test_the_network_has_the_learners_numbers() -> None:
     "wrong",
     [
         {"steps": 0},
-        {"max_rows": 100},
+        {"max_rows": 1},
         {"variance_rows": 513},
         {"tolerance": -1.0},
     ],

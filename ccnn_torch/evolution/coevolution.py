@@ -299,7 +299,7 @@ def advance(state: Coevolution, task: Task, settings: CCNNSettings, seeds: Tenso
         taken = sum(len(before) for before in shapes[:layer])
         draws = BreedingDraws(*numbers[taken : taken + len(shapes[layer])])
         children = breed(population, scores, settings, progress, draws)
-        renewed = with_elites(children, population, scores, state.best[layer], settings)
+        renewed = with_elites(children, population, scores, state.best[layer])
         state = _judge(state, layer, renewed, company[:, layer], task)
     return state
 

@@ -170,6 +170,8 @@ def nonuniform_mutation(
     return Genome(genome.mask, torch.where(chosen & active(genome), stepped, genome.weight))
 
 
+ELITES = 2
+"""Individuals that survive unchanged: the part of the best joined network, and the next best."""
 # What the paper leaves open and what made no difference on its cases: contestants of one tournament, cut points of a
 # crossover. b of eq. 13 is the paper's.
 CONTESTANTS, CUTS, EXPONENT = 3, 2, 2.0
@@ -197,7 +199,7 @@ class BreedingDraws(NamedTuple):
 
 def breeding_shapes(population: Genome, settings: EvolutionSettings) -> list[tuple[int, ...]]:
     """Shapes of `BreedingDraws` for one repeat."""
-    half = (settings.population - settings.elites + 1) // 2
+    half = (settings.population - ELITES + 1) // 2
     bits, reals = tuple(population.mask.shape[2:]), tuple(population.weight.shape[2:])
     return [
         (2 * half, CONTESTANTS),
@@ -222,7 +224,7 @@ def initial_population(outputs: int, inputs: int, settings: EvolutionSettings, s
 def breed(
     population: Genome, fitness: Tensor, settings: EvolutionSettings, progress: float, draws: BreedingDraws
 ) -> Genome:
-    """Children of one subpopulation, `r x (population - elites) x ...`.
+    """Children of one subpopulation, `r x (population - ELITES) x ...`.
 
     Args:
         population: `r x p x ...`.
@@ -273,13 +275,11 @@ def _children(
     first = flip_connections(first, draws.flips < settings.structural_mutation, (draws.fresh * 2 - 1) * limit)
     chosen = (draws.genes < settings.weight_mutation) | weakest_draw(second, draws.genes)
     second = nonuniform_mutation(second, chosen, draws.steps, progress, -limit, limit, EXPONENT)
-    count = settings.population - settings.elites
+    count = settings.population - ELITES
     return mapped(lambda one, other: torch.cat([one, other], 1)[:, :count], first, second)
 
 
-def with_elites(
-    children: Genome, population: Genome, fitness: Tensor, best: Genome, settings: EvolutionSettings
-) -> Genome:
+def with_elites(children: Genome, population: Genome, fitness: Tensor, best: Genome) -> Genome:
     """Elites before the children: the part of the best joined network, then the best of the population.
 
     Individuals as fit as the best of their subpopulation are copies of that part and not taken twice.
@@ -287,9 +287,5 @@ def with_elites(
     Args:
         best: that part, `r x 1 x ...`.
     """
-    parts = [best]
-    if settings.elites > 1:
-        others = fitness.masked_fill(fitness == fitness.amax(-1, keepdim=True), -torch.inf)
-        parts.append(select(population, others.topk(settings.elites - 1, dim=-1).indices))
-    parts.append(children)
-    return joined(parts, 1)
+    others = fitness.masked_fill(fitness == fitness.amax(-1, keepdim=True), -torch.inf)
+    return joined([best, select(population, others.topk(ELITES - 1, dim=-1).indices), children], 1)

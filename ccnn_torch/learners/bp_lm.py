@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
@@ -19,7 +20,7 @@ from ccnn_torch.evolution.refinement import (
     start_refinement,
     step_refinement,
 )
-from ccnn_torch.evolution.settings import check_least
+from ccnn_torch.evolution.settings import STRICT, Above, Count, Widths
 from ccnn_torch.learners.protocol import TrainingData, weighted_mse
 from ccnn_torch.learners.rows import OneNetwork, usable_rows
 from ccnn_torch.numerics.trees import picked, put
@@ -27,7 +28,7 @@ from ccnn_torch.numerics.trees import picked, put
 _STARTS = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class BPLMSettings:
     """Settings of BP-LM; the paper gives none of its own.
 
@@ -44,19 +45,11 @@ class BPLMSettings:
         ValueError: a value out of its range, in one sentence with the key.
     """
 
-    hidden: tuple[int, ...] = (20,)
-    restarts: int = 6
-    iterations: int = 60
-    tolerance: float = 1e-3
-    patience: int = 3
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden", tuple(self.hidden))
-        if not self.hidden or not all(width >= 1 for width in self.hidden):
-            raise ValueError(f"hidden={list(self.hidden)}: at least one hidden layer, each with at least one node")
-        check_least(self, restarts=1, iterations=1, patience=1)
-        if not 0 < self.tolerance < math.inf:
-            raise ValueError(f"tolerance={self.tolerance} must be above 0")
+    hidden: Annotated[Widths, Field(min_length=1)] = (20,)
+    restarts: Count = 6
+    iterations: Count = 60
+    tolerance: Above = 1e-3
+    patience: Count = 3
 
 
 class BPLM(OneNetwork):

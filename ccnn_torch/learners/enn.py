@@ -72,7 +72,7 @@ class ENN(OneNetwork):
         progress = self._generation / settings.generations
         children = breed_networks(self._layers, self._fitness, settings, progress, draws)
         self._layers = [
-            with_elites(new, old, self._fitness, best, settings)
+            with_elites(new, old, self._fitness, best)
             for new, old, best in zip(children, self._layers, self._best, strict=True)
         ]
         self._judge()

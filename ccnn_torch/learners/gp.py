@@ -7,13 +7,15 @@ with its early stopping and its checkpoints. scikit-learn's `fit` is one process
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
-from ccnn_torch.evolution.settings import check_least
+from ccnn_torch.evolution.settings import STRICT, Count, Some
 from ccnn_torch.learners.gaussian_process import (
     NOISE_FLOOR,
     Evidence,
@@ -45,7 +47,7 @@ _SMOOTH, _NOISY = 0.7, -3.0
 _ORDER_STREAM = 71
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class GPSettings:
     """Settings of the Gaussian process.
 
@@ -62,22 +64,11 @@ class GPSettings:
         ValueError: a value out of its range, in one sentence with the key.
     """
 
-    steps: int = 100
-    tolerance: float = 0.01
-    hyperparameter_rows: int = 600
-    max_rows: int = 3000
-    variance_rows: int = 256
-
-    def __post_init__(self) -> None:
-        check_least(self, steps=1, hyperparameter_rows=2, max_rows=2, variance_rows=1)
-        if self.max_rows < self.hyperparameter_rows:
-            raise ValueError(
-                f"max_rows={self.max_rows} must be at least hyperparameter_rows={self.hyperparameter_rows}"
-            )
-        if self.variance_rows > 512:
-            raise ValueError(f"variance_rows={self.variance_rows} must be at most 512: model files hold its square")
-        if not self.tolerance >= 0:
-            raise ValueError(f"tolerance={self.tolerance} must not be negative")
+    steps: Count = 100
+    tolerance: Annotated[float, Field(ge=0)] = 0.01
+    hyperparameter_rows: Some = 600
+    max_rows: Some = 3000
+    variance_rows: Annotated[int, Field(ge=1, le=512)] = 256
 
 
 def bfgs(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
-from ccnn_torch.evolution.settings import check_least
+from ccnn_torch.evolution.settings import STRICT, Count, Some
 from ccnn_torch.learners.grnn_network import FARTHEST, GRNNNetwork, KernelMeans, KernelVariance, blocked_means
 from ccnn_torch.learners.protocol import TrainingData, weighted_mse
 from ccnn_torch.learners.rows import taken, usable_rows
@@ -29,7 +29,7 @@ _SMALLEST_MOVE = 1.05
 _CAUTION = 1.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class GRNNSettings:
     """Settings of the GRNN; the paper gives none of its own.
 
@@ -46,15 +46,10 @@ class GRNNSettings:
         ValueError: a value out of its range, in one sentence with the key.
     """
 
-    iterations: int = 30
-    candidates: int = 32
-    queries: int = 500
-    references: int = 2000
-
-    def __post_init__(self) -> None:
-        check_least(self, iterations=1, candidates=2, queries=2, references=2)
-        if self.references < self.queries:
-            raise ValueError(f"references={self.references} must be at least queries={self.queries}")
+    iterations: Count = 30
+    candidates: Some = 32
+    queries: Some = 500
+    references: Some = 2000
 
 
 class GRNN:
@@ -90,7 +85,7 @@ class GRNN:
         count = rows.weights.shape[1]
         keys = uniform(self._seeds, _ROWS, 0, (count,)) + (rows.weights == 0)
         self._judged = taken(rows, keys.argsort(-1)[:, : self.settings.references])
-        self._own = torch.arange(min(self.settings.queries, count), device=keys.device)
+        self._own = torch.arange(min(self.settings.queries, self.settings.references, count), device=keys.device)
         repeats, width = len(data.seeds), data.inputs.shape[-1]
         self._inverse = rows.inputs.new_zeros(repeats, width)
         self._move = rows.inputs.new_full((repeats,), _FIRST_MOVE)
