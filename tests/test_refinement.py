@@ -214,9 +214,9 @@ def test_steps_interrupted_and_resumed_are_the_same_bit_by_bit() -> None:
     state = start_refinement(problem, weights)
     for iteration in range(9):
         if iteration == 4:
-            stored = {name: value.clone() for name, value in state.state_dict().items()}
+            stored = {name: value.clone() for name, value in state._asdict().items()}
             problem = pose_refinement(masks, weights, x, targets, rows)
-            state = RefinementState.from_state_dict(stored)
+            state = RefinementState(**stored)
         state = step_refinement(problem, state)
     pieces = finish_refinement(problem, state)
     assert pieces.iterations == whole.iterations == 9

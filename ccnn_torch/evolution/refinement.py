@@ -14,7 +14,7 @@ the same in steps, with everything that changes in a `RefinementState` of plain 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -61,8 +61,7 @@ class RefinementProblem:
     warm_up: int
 
 
-@dataclass(frozen=True)
-class RefinementState:
+class RefinementState(NamedTuple):
     """What changes from iteration to iteration.
 
     Attributes:
@@ -87,15 +86,6 @@ class RefinementState:
     def done(self) -> Tensor:
         """Networks that do not move any more, `b` bool."""
         return self.calm >= _CALM
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """All tensors by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    @classmethod
-    def from_state_dict(cls, state: dict[str, Tensor]) -> RefinementState:
-        """Inverse of `state_dict`."""
-        return cls(**{f.name: state[f.name] for f in fields(cls)})
 
 
 class SecondOrder(NamedTuple):
@@ -232,9 +222,9 @@ def refine(
         # The last one has not been judged; re-estimated precisions may have taken it downhill.
         last = log_evidence(problem, state)
         worse = torch.nonzero(~(last >= highest) & (highest > -torch.inf)).flatten()
-        state = replace(put(state, worse, picked(best, worse)), iteration=state.iteration)
+        state = put(state, worse, picked(best, worse))._replace(iteration=state.iteration)
     worse = ~(_objective(problem, state, state.weights) <= _objective(problem, state, start.weights))
-    state = replace(state, weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
+    state = state._replace(weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
     return finish_refinement(problem, state)
 
 
@@ -309,12 +299,11 @@ def start_refinement(
         # Counted by the host, which need not wait to read it.
         iteration=torch.zeros((), dtype=torch.int64, device="cpu"),
     )
-    state = replace(state, noise=_noise(problem, state))
+    state = state._replace(noise=_noise(problem, state))
     if known is None:
         return state
     prior, noise, damping = known
-    return replace(
-        state,
+    return state._replace(
         prior=torch.where(prior > 0, prior, state.prior),
         noise=torch.where(noise > 0, noise, state.noise),
         damping=torch.where(damping > 0, damping, state.damping),
@@ -351,8 +340,7 @@ def step_refinement(
         todo = todo[~good]
         if len(todo) == 0:
             break
-    moved = replace(
-        state,
+    moved = state._replace(
         weights=weights,
         damping=damping.clamp(*_DAMPING_RANGE),
         calm=torch.where(before - reached < _TOLERANCE * before, state.calm + 1, 0),
@@ -463,12 +451,11 @@ def _estimate_precisions(problem: RefinementProblem, state: RefinementState, kno
     prior = ((effective + 2 * shape) / (squares + 2 * rate)).clamp(*_PRECISION_RANGE)
     prior[:, -1] = _PRECISION_RANGE[0]
     usable = ((failed == 0) & effective.isfinite().all(-1)).unsqueeze(-1)
-    estimated = replace(
-        state,
+    estimated = state._replace(
         prior=torch.where(usable, prior, state.prior),
         effective=torch.where(usable, effective, state.effective),
     )
-    return replace(estimated, noise=_noise(problem, estimated))
+    return estimated._replace(noise=_noise(problem, estimated))
 
 
 def _flatten(tensor: Tensor, leading: tuple[int, ...], trailing: int) -> Tensor:

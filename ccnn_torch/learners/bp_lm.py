@@ -151,7 +151,7 @@ class BPLM(OneNetwork):
         known = {"log_evidence": self._evidence, "rest": self._rest, "iterations_made": self._iterations}
         tensors = {
             name: self._apart(value) if value.dim() else value
-            for name, value in (self._state.state_dict() | known).items()
+            for name, value in (self._state._asdict() | known).items()
         }
         return tensors | {"best": self._best, "best_evidence": self._best_evidence}
 
@@ -159,7 +159,7 @@ class BPLM(OneNetwork):
         """Take back a state; call `start` with the same data first."""
         self._best, self._best_evidence = state["best"], state["best_evidence"]
         flat = {name: value.flatten(0, 1) if value.dim() > 1 else value for name, value in state.items()}
-        self._state = RefinementState.from_state_dict(flat)
+        self._state = RefinementState(*(flat[name] for name in RefinementState._fields))
         self._evidence, self._rest, self._iterations = (flat[k] for k in ("log_evidence", "rest", "iterations_made"))
         self._known = second_order(self._problem, self._state)
 

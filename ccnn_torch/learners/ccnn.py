@@ -61,7 +61,7 @@ class CCNN:
         self._gears = _gears(data, settings)
         if self._gears is not None:
             there = (data.weights > 0).unsqueeze(-1)
-            left = data.targets - self._gears.deviation(data.inputs)
+            left = data.targets - self._gears(data.inputs)
             data = replace(data, targets=torch.where(there, left, data.targets))
         inputs, targets, weights = (
             part.repeat_interleave(members, dim=0) for part in (data.inputs, data.targets, data.weights)
@@ -114,7 +114,7 @@ class CCNN:
     def predict(self, inputs: Tensor) -> Tensor:
         """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
         output = self._remainder(inputs)
-        return output if self._gears is None else output + self._gears.deviation(inputs)
+        return output if self._gears is None else output + self._gears(inputs)
 
     def _remainder(self, inputs: Tensor) -> Tensor:
         """What the networks say, without the harmonics."""
