@@ -284,39 +284,21 @@ def compare(
         MethodFailedError: no method could be compared: they failed, or the budget was too small.
     """
     comparison = Comparison(budget, plan.folds)
+    early = f"the budget of {budget:g} s was spent before"
     for name, make in makers.items():
-        found = _judge(name, make, dataset, plan, comparison, folder, watch)
-        if isinstance(found, Choice):
-            comparison.compared[name] = found
-            comparison.spent += found.seconds
-        else:
-            comparison.skipped[name] = found
+        began = time.perf_counter()
+        try:
+            if comparison.spent >= budget:
+                raise MethodFailedError(f"{early} it began")
+            choice = choose(name, make, dataset, plan, folder, watch(name), budget - comparison.spent)
+            if choice is None:
+                comparison.spent = budget
+                raise MethodFailedError(f"{early} its first step")
+            comparison.compared[name] = choice
+            comparison.spent += choice.seconds
+        except MethodFailedError as problem:
+            comparison.skipped[name] = str(problem)
+            comparison.spent += time.perf_counter() - began
     if not comparison.compared:
         raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in comparison.skipped.items()))
     return comparison
-
-
-def _judge(
-    name: str,
-    make: Callable[[], Learner],
-    dataset: Dataset,
-    plan: Plan,
-    comparison: Comparison,
-    folder: RunFolder | None,
-    watch: Callable[[str], WatchPhase],
-) -> Choice | str:
-    """Cross-validate one method; returns a sentence where that is not to be had."""
-    budget = comparison.budget
-    left = budget - comparison.spent
-    if left <= 0:
-        return f"the budget of {budget:g} s was spent before it began"
-    began = time.perf_counter()
-    try:
-        choice = choose(name, make, dataset, plan, folder, watch(name), left)
-    except MethodFailedError as problem:
-        comparison.spent += time.perf_counter() - began
-        return str(problem)
-    if choice is None:
-        comparison.spent = budget
-        return f"the budget of {budget:g} s was spent before its first step"
-    return choice
