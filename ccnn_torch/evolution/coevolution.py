@@ -22,7 +22,7 @@ from torch import Tensor
 from ccnn_torch.evolution.genome import (
     BreedingDraws,
     Genome,
-    breed,
+    breed_networks,
     breeding_shapes,
     initial_population,
     select,
@@ -298,7 +298,7 @@ def advance(state: Coevolution, task: Task, settings: CCNNSettings, seeds: Tenso
     for layer, (population, scores) in enumerate(zip(state.populations, state.fitness, strict=True)):
         taken = sum(len(before) for before in shapes[:layer])
         draws = BreedingDraws(*numbers[taken : taken + len(shapes[layer])])
-        children = breed(population, scores, settings, progress, draws)
+        (children,) = breed_networks([population], scores, settings, progress, [draws])
         renewed = with_elites(children, population, scores, state.best[layer])
         state = _judge(state, layer, renewed, company[:, layer], task)
     return state

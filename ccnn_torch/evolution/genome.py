@@ -221,19 +221,6 @@ def initial_population(outputs: int, inputs: int, settings: EvolutionSettings, s
     return Genome(mask, kept(mask, weight))
 
 
-def breed(
-    population: Genome, fitness: Tensor, settings: EvolutionSettings, progress: float, draws: BreedingDraws
-) -> Genome:
-    """Children of one subpopulation, `r x (population - ELITES) x ...`.
-
-    Args:
-        population: `r x p x ...`.
-        fitness: `r x p`.
-        progress: t / T of eq. 13.
-    """
-    return breed_networks([population], fitness, settings, progress, [draws])[0]
-
-
 def breed_networks(
     layers: Sequence[Genome],
     fitness: Tensor,
