@@ -322,18 +322,8 @@ def _choice(
     if verdict is not None:
         records, verdict, said = without_frame_drift(mechanism, records, rows, verdict, identify)
         asked, notes = asked and verdict is not None, [*notes, *said]
-    about = (
-        split,
-        config.split.kind,
-        config.seed,
-        settings,
-        config.geometry,
-        verdict,
-        asked,
-        method_names(config, "") == [""],
-        _unlearnable(mechanism, records),
-    )
-    choice = choose_model(mechanism, records, *about)
+    about = (settings, verdict, asked, _unlearnable(mechanism, records))
+    choice = choose_model(config, mechanism, records, split, *about)
     return choice, verdict if choice.effects else None, records, notes
 
 
