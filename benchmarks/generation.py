@@ -19,7 +19,7 @@ from benchmarks.measure import Call, Row, compare
 from benchmarks.peers import generation_peers
 from ccnn_torch.evolution import CCNNSettings
 from ccnn_torch.evolution.coevolution import EPSILON, REPRESENTATIVES, advance, make_task, start
-from ccnn_torch.evolution.genome import CONTESTANTS, CUTS, EXPONENT
+from ccnn_torch.evolution.genome import CONTESTANTS, CUTS, ELITES, EXPONENT
 
 Array = NDArray[np.float64]
 Individual = tuple[NDArray[np.bool_], Array]
@@ -109,7 +109,7 @@ class NumpyLoop:
         self.done = min(self.done + 1, settings.generations - 1)
         for layer, population in enumerate(self.populations):
             order = np.argsort(-self.fitness[layer])
-            renewed = [self.best[layer], *(population[i] for i in order[1 : settings.elites])]
+            renewed = [self.best[layer], *(population[i] for i in order[1:ELITES])]
             while len(renewed) < settings.population:
                 renewed += self.children(population, self.fitness[layer])
             self.populations[layer] = renewed[: settings.population]

@@ -17,3 +17,9 @@ def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | 
     folded = {candidate.lower(): candidate for candidate in reversed(candidates)}
     near = difflib.get_close_matches(name.lower(), folded, 1, cutoff)
     return folded[near[0]] if near else None
+
+
+def hint(name: str, candidates: Sequence[str], otherwise: str = "there are", more: str = "") -> str:
+    """What to write instead of a name that is none of the candidates: the nearest, or all of them after `otherwise`."""
+    near = nearest(name, candidates)
+    return f"did you mean '{near}'?" if near else f"{otherwise} {', '.join(candidates) or 'none'}{more}"

@@ -19,10 +19,9 @@ from toy import Descent
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.dataset import Dataset
 from ccnn_torch.calibration.early_stop import Plan
-from ccnn_torch.calibration.method_choice import Comparison, compare
+from ccnn_torch.calibration.fitting import Comparison, compare
 from ccnn_torch.calibration.page import run_page
-from ccnn_torch.errors import InputError, MethodFailedError
-from ccnn_torch.learners import Learner
+from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners.constant import Constant
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.run_folder.folder import RunFolder
@@ -103,29 +102,14 @@ def test_what_fails_is_skipped_with_its_sentence() -> None:
     assert comparison.skipped == {"broken": "the curvature is not finite"}
 
 
-def test_a_decision_is_read_back_and_not_made_again(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text("")
+def test_a_decision_is_made_again_from_the_checkpoints(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
-    first = compared(linear_dataset(2), 100, folder)
-
-    def never() -> Learner:
-        raise AssertionError
-
-    again = compare(
-        {"constant": never, "descent": never}, linear_dataset(2), PLAN, 100, folder, lambda name: lambda *_: []
-    )
-    assert again.order == first.order and again.spent == first.spent
+    first, again = (compared(linear_dataset(2), 0.25, folder, slow=Slow) for _ in range(2))
+    assert again.order == first.order and again.spent == first.spent and not again.compared["slow"].ended
     for name, choice in first.compared.items():
         for key, value in vars(choice).items():
             other = getattr(again.compared[name], key)
             assert torch.equal(other, value) if isinstance(value, torch.Tensor) else other == value, key
-    written = folder.auto.read_text()
-    folder.auto.write_text(written.replace('"spent": ', '"spent": 1'))
-    with pytest.raises(InputError, match=r"auto\.json is damaged"):
-        compared(linear_dataset(2), 100, folder)
-    folder.auto.write_text('{"compared": {"constant": {}}, "skipped": {}}')
-    with pytest.raises(InputError, match=r"auto\.json is damaged"):
-        compared(linear_dataset(2), 100, folder)
 
 
 def config(out: Path, **keys: Any) -> Any:
@@ -169,7 +153,6 @@ def test_a_run_killed_on_its_way_resumes_to_the_same_result(
         with pytest.raises(Killed):
             calibrate(chosen, RunFolder(tmp_path / "killed"))
     killed = RunFolder(tmp_path / "killed")
-    assert killed.auto.is_file() == (moment == "between")
     other = calibrate(chosen, killed).results
     text = run_page(other).markdown()
     assert "## Methods compared by cross-validation" in text and "Descent is chosen" in text

@@ -11,10 +11,9 @@ from torch import Tensor
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.prepare import prepare
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.evolution.gauss_newton import dense_jacobian, network_of
 from ccnn_torch.evolution.network import forward
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings, _nguyen_widrow
+from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.training import train
 
 
@@ -38,31 +37,6 @@ def trained(data: TrainingData, settings: BPLMSettings) -> tuple[BPLM, list[dict
     while not learner.finished:
         history.append(learner.step())
     return learner, history
-
-
-def test_the_closed_jacobian_is_that_of_torch_func() -> None:
-    """In one batch over networks and rows: `vmap` of reverse mode, which also transforms the network itself."""
-    seeds = torch.arange(3)
-    sizes = (4, 5, 3, 2)
-    weights = [layer[:, 0] for layer in _nguyen_widrow(sizes, seeds, 1)]
-    masks = [torch.ones(3, w.shape[1], w.shape[2] - 1, dtype=torch.bool) for w in weights]
-    generator = torch.Generator().manual_seed(1)
-    inputs = torch.randn(3, 9, 4, generator=generator, dtype=torch.float64)
-    flat = torch.cat([w.flatten(1) for w in weights], 1)
-
-    def output(vector: Tensor, row: Tensor) -> Tensor:
-        signal = row
-        parts = torch.split(vector, [w[0].numel() for w in weights])
-        for number, (part, like) in enumerate(zip(parts, weights, strict=True)):
-            matrix = part.reshape(like.shape[1:])
-            signal = torch.sigmoid(signal) if number else signal
-            signal = matrix[:, :-1] @ signal + matrix[:, -1]
-        return signal
-
-    of_row = torch.func.vmap(torch.func.jacrev(output), in_dims=(None, 0))
-    expected = torch.func.vmap(of_row)(flat, inputs)
-    found = dense_jacobian(network_of(masks, bias=True), flat, inputs, torch.zeros(3, 9, 2, dtype=torch.float64))
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
 
 
 def test_a_small_known_network_is_recovered() -> None:
@@ -138,7 +112,7 @@ def test_rows_that_are_not_finite_are_refused() -> None:
 
 @pytest.mark.parametrize(
     ("keys", "sentence"),
-    [({"hidden": []}, "hidden"), ({"restarts": 0}, "restarts=0 must be at least 1"), ({"tolerance": 0.0}, "tolerance")],
+    [({"hidden": []}, "hidden"), ({"restarts": 0}, "restarts"), ({"tolerance": 0.0}, "tolerance")],
 )
 def test_settings_out_of_range_are_named(keys: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):

@@ -32,14 +32,13 @@ SMALL = {
 
 FACTORIES: dict[str, Callable[[], Learner]] = {
     "ccnn": lambda: CCNN(CCNNSettings(**SMALL)),
-    "ccnn_without_bias": lambda: CCNN(CCNNSettings(**SMALL, bias=False, elites=3)),
+    "ccnn_without_bias": lambda: CCNN(CCNNSettings(**SMALL, bias=False)),
     "ccnn_refined": lambda: CCNN(
         CCNNSettings(
             **{
                 **SMALL,
                 "generations": 4,
                 "refinement_iterations": 2,
-                "refine_every": 2,
                 "members": 2,
                 "rival_hidden": (2,),
                 "waves": 4,
@@ -52,7 +51,7 @@ FACTORIES: dict[str, Callable[[], Learner]] = {
     "grnn": lambda: GRNN(GRNNSettings(iterations=5, candidates=6)),
     "grnn_some_rows": lambda: GRNN(GRNNSettings(iterations=4, candidates=6, queries=10, references=40)),
     "enn": lambda: ENN(ENNSettings(hidden=(3, 2), population=10, generations=6)),
-    "enn_without_bias": lambda: ENN(ENNSettings(hidden=(4,), population=9, generations=5, bias=False, elites=3)),
+    "enn_without_bias": lambda: ENN(ENNSettings(hidden=(4,), population=9, generations=5, bias=False)),
     "constant": Constant,
     "descent": lambda: Descent(steps=8),
     "a user's": lambda: make_learner(EXAMPLE),

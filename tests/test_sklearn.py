@@ -44,7 +44,7 @@ TINY: dict[type[Any], dict[str, Any]] = {
 GRIDS: dict[type[Any], dict[str, Any]] = {
     CCNNRegressor: {"hidden": [(4,), (6, 6)]},
     BPLMRegressor: {"hidden": [(3,), (3, 3)]},
-    GRNNRegressor: {"widest": [1.0, 5.0]},
+    GRNNRegressor: {"candidates": [8, 32]},
     ENNRegressor: {"hidden": [4, (6, 6)]},
 }
 # Parameters whose default may be another than the run's, as the docstring says.

@@ -20,7 +20,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from ccnn_torch.evolution import CCNNSettings
 from ccnn_torch.evolution.coevolution import advance, make_task, start
 from ccnn_torch.evolution.refinement import (
-    RefinementSettings,
     finish_refinement,
     pose_refinement,
     refine,
@@ -91,8 +90,6 @@ def test_a_refinement_waits_once_a_trial_and_once_an_iteration() -> None:
     known = second_order(problem, state)
     counted = waits(lambda: step_refinement(problem, state, known))
     assert counted.keys() == {"index"} and counted["index"] == factors(lambda: step_refinement(problem, state, known))
-    few, more = (
-        waits(lambda n=n: refine(masks, weights, x, y, ones, RefinementSettings(iterations=n))) for n in (5, 10)
-    )
+    few, more = (waits(lambda n=n: refine(masks, weights, x, y, ones, n)) for n in (5, 10))
     assert more["nonzero"] - few["nonzero"] == 5
     assert more["_local_scalar_dense"] == few["_local_scalar_dense"] <= 2

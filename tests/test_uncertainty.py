@@ -14,7 +14,7 @@ from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.dataset import Dataset
 from ccnn_torch.calibration.early_stop import Plan
 from ccnn_torch.calibration.fitting import Fitted, fit_method
-from ccnn_torch.calibration.uncertainty import coverage, inside_domain, sd_scale
+from ccnn_torch.calibration.statistics import coverage, inside_domain, sd_scale
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.records.splits import Split
 

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
-from ccnn_torch.calibration.fitting import Fitted, fit_method, on_other_rows, refit
-from ccnn_torch.calibration.method_choice import Comparison, compare
+from ccnn_torch.calibration.fitting import Comparison, Fitted, compare, fit_method, on_other_rows, refit
 from ccnn_torch.calibration.prepare import Prepared, damping_of, over_all_rows, prepare
 from ccnn_torch.calibration.result import best_method, chosen_by, plan_of, run_results
 from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model

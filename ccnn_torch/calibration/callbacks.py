@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,8 +27,8 @@ from ccnn_torch.report.screen import progress_bar
 from ccnn_torch.training import Scaling
 
 _PER_SUBPOPULATION = ("density", "diversity")
-_CELL = 16
-"""Pixels a connection gets in the picture of a mask."""
+_CELL, _MASKS_EVERY = 16, 20
+"""Pixels a connection gets in the picture of a mask, which is written each so many steps."""
 
 
 class TensorBoardCallback:
@@ -50,7 +50,6 @@ class TensorBoardCallback:
         folder: str | Path,
         *,
         every: int = 1,
-        masks_every: int = 20,
         tell: Callable[[str], None] = lambda sentence: None,
     ) -> None:
         """Make the callback.
@@ -58,13 +57,11 @@ class TensorBoardCallback:
         Args:
             folder: where the event files go.
             every: write scalars each so many steps.
-            masks_every: write the masks each so many steps.
             tell: is given the sentence when the curves cannot be written any further.
         """
         self._folder = Path(folder)
         self._masks: Callable[[], Sequence[ArrayLike]] | None = None
         self._every = every
-        self._masks_every = masks_every
         self._tell, self._told = tell, False
         self._writer: EventFile | None = None
 
@@ -89,13 +86,12 @@ class TensorBoardCallback:
             for name, value in metrics.items():
                 for tag, number in tags_of(name, value).items():
                     self._writer.add_scalar(tag, number, step, walltime=self._walltime(seconds))
-        if self._masks is not None and (step % self._masks_every == 0 or step == 1):
+        if self._masks is not None and (step % _MASKS_EVERY == 0 or step == 1):
             for layer, mask in enumerate(self._masks(), start=1):
                 picture = np.kron(np.asarray(mask, dtype=np.uint8), np.ones((_CELL, _CELL), dtype=np.uint8)) * 255
                 png = io.BytesIO()
                 Image.fromarray(picture).save(png, "PNG")
                 self._writer.add_image(f"masks/layer_{layer}", png.getvalue(), step)
-        self._writer.flush()
         if self._writer.failed is not None and not self._told:
             self._told = True
             self._tell(f"{self._folder}: the curves end at step {step} ({self._writer.failed}); the run goes on")
@@ -152,8 +148,8 @@ _files = itertools.count()
 class EventFile:
     """One event file, written by the calling thread.
 
-    torch's own `SummaryWriter` writes in a thread of its own, whose exception on a full disk cannot be caught. Here the
-    file ends with the last whole record, `failed` gives the reason, and later records are dropped: the run continues.
+    torch's own `SummaryWriter` writes in a thread of its own, whose exception on a full disk cannot be caught. Here
+    `failed` gives the reason, and later records are dropped: the run continues.
     """
 
     def __init__(self, folder: Path, purge_step: int | None = None) -> None:
@@ -169,16 +165,14 @@ class EventFile:
 
         self._event: Any = event_pb2.Event
         self._summary: Any = summary_pb2.Summary
-        self._pending = io.BytesIO()
-        self._records = RecordWriter(self._pending)
-        self._file: io.FileIO | None = None
         self.failed: str | None = None
         # TensorBoard reads the files of a folder in the order of their names, and two may begin within a second.
         seconds, rest = divmod(time.time_ns(), 1_000_000_000)
         name = f"events.out.tfevents.{seconds:010}.{rest:09}.{socket.gethostname()}.{os.getpid()}.{next(_files):06}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._file = io.FileIO(folder / name, "w")
+            # Without a buffer: what a full disk does not take is not tried again.
+            self._records = RecordWriter(io.FileIO(folder / name, "w"))
         except OSError as reason:
             self.failed = reason.strerror
         self._add(None, file_version="brain.Event:2")
@@ -194,42 +188,22 @@ class EventFile:
         width, height = struct.unpack(">II", png[16:24])
         self._add_value(step, tag=tag, image={"width": width, "height": height, "encoded_image_string": png})
 
-    def flush(self) -> None:
-        """Write the added records to the file, so that TensorBoard sees them."""
-        content = memoryview(self._pending.getvalue())
-        self._pending.seek(0)
-        self._pending.truncate()
-        if self._file is None:
-            return
-        whole = self._file.tell()
-        try:
-            while content:
-                # A disk that fills up may accept a part.
-                content = content[self._file.write(content) or 0 :]
-        except OSError as reason:
-            self.failed = reason.strerror
-            self._file.truncate(whole)
-            self._file.close()
-            self._file = None
-
     def close(self) -> None:
-        self.flush()
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        if self.failed is None:
+            self._records.close()
 
     def _add_value(self, step: int, walltime: float | None = None, **content: Any) -> None:
         self._add(walltime, step=step, summary=self._summary(value=[self._summary.Value(**content)]))
 
     def _add(self, walltime: float | None, **content: Any) -> None:
         event = self._event(wall_time=time.time() if walltime is None else walltime, **content)
-        self._records.write(event.SerializeToString())
+        if self.failed is not None:
+            return
+        try:
+            self._records.write(event.SerializeToString())
+        except OSError as reason:
+            self.failed = reason.strerror
+            self._records.close()
 
 
 class ProgressBar:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.dataset import dataset_of, rows_of
 from ccnn_torch.calibration.early_stop import Plan
 from ccnn_torch.calibration.fitting import fit_method
@@ -81,16 +82,13 @@ class ModelChoice:
 
 
 def choose_model(
+    config: RunConfig,
     mechanism: Mechanism,
     records: Records,
     split: Split,
-    kind: str,
-    seed: int,
     settings: dict[str, Any],
-    geometry: str,
     verdict: Verdict | None,
     asked_effects: bool,
-    learner_open: bool,
     unlearnable: str = "",
 ) -> ModelChoice:
     """Compare what the config leaves open by the held-out pose errors under the candidates' own commands.
@@ -100,14 +98,13 @@ def choose_model(
     simpler candidate is kept unless a later one is better by more than a standard error of the folds' differences.
 
     Args:
-        split, kind: of the repeat; `kind` says how folds are made.
-        geometry: the key of the config.
+        split: of the repeat.
+        settings: of `joint_deviations`.
         verdict: effects that were found in the training rows, or that a file names; None without any.
         asked_effects: whether the effects are a part of every candidate.
-        learner_open: whether the config leaves the learner to the comparison.
         unlearnable: why there is nothing that a learner could have; empty where there is.
     """
-    learns = not unlearnable
+    learns, geometry = not unlearnable, config.geometry
     name, other = mechanism.name, _ELSE if learns else "constant"
     geometry_why = ""
     if geometry != "none" and not mechanism.geometry:
@@ -123,19 +120,20 @@ def choose_model(
     physical = [Candidate(i, e, False) for e in effects for i in (identify if not e else identify[:1]) if i or e]
     asked = "" if geometry == "auto" else geometry_why or f"geometry={geometry} was asked for."
     nominal_too = False in identify and not asked_effects and learns
-    if not physical or (len(physical) == 1 and not nominal_too and not (learner_open and learns)):
+    if not physical or (len(physical) == 1 and not nominal_too and not (learns and method_names(config, "") == [""])):
         why = f"No learner is trained: {unlearnable}." if unlearnable else ""
         return ModelChoice(identify[0], effects[0], other, f"{asked} {why}".strip())
     rows = torch.cat([split.train, split.validation])
     if len(rows) > _MOST_ROWS:
-        rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]
+        rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(config.seed))[:_MOST_ROWS]]
     rows = rows.sort().values
     few = rows_of(records, rows)
     none = torch.zeros(0, dtype=torch.int64)
     whole = Split(torch.arange(len(rows)), none, none, None if split.groups is None else split.groups[rows])
     try:
-        folds = [replace(f, validation=none, test=f.validation) for f in fold_splits(whole, kind, _FOLDS, seed)]
-        errors = _errors(mechanism, few, folds, seed, settings, physical, nominal_too, verdict, learns)
+        folds = fold_splits(whole, config.split.kind, _FOLDS, config.seed)
+        folds = [replace(f, validation=none, test=f.validation) for f in folds]
+        errors = _errors(mechanism, few, folds, config.seed, settings, physical, nominal_too, verdict, learns)
     except (InputError, MethodFailedError) as problem:
         why = f"Candidates could not be cross-validated: {problem}"
         return ModelChoice(geometry == "identify", effects[0], other, why)

@@ -20,13 +20,12 @@ from ccnn_torch.config.tree import (
     Section,
 )
 from ccnn_torch.effects import EFFECTS
-from ccnn_torch.engine import Engine
 from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.learners.registry import LEARNERS
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 
 
 def _one(value: Any) -> Any:
@@ -120,9 +119,8 @@ class AutoConfig(_Part):
 def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
     for method in methods:
         if method not in choices and ".py:" not in method:
-            near = nearest(method, choices)
-            hint = f"did you mean '{near}'?" if near else f"known are {', '.join(choices)} and file.py:Name"
-            raise ValueError(f"there is no method '{method}'; {hint}")
+            near = hint(method, choices, "known are", " and file.py:Name")
+            raise ValueError(f"there is no method '{method}'; {near}")
         if methods.count(method) > 1:
             raise ValueError(f"'{method}' is given twice")
     return methods
@@ -145,22 +143,11 @@ class RunConfig(JobConfig):
         description=f"learners: a list of {', '.join(LEARNERS)}; all = these; auto = the best of auto.methods "
         "by cross-validation; null = ccnn, and where geometry=auto compared a learner, what that comparison prefers",
     )
-    engine: Engine = Field(
-        default="local",
-        description="where blocks of repeats run: local, processes, dask (a cluster on this machine), or a scheduler's "
-        "address, tcp://HOST:8786",
-    )
-    block: int | None = Field(
-        default=None,
-        ge=1,
-        description="repeats of one job, a run of its own in blocks/; null = with engine=local as many as "
-        "max_bytes hold, else 1",
-    )
     max_bytes: int | None = Field(
         default=None,
         ge=1,
-        description="memory in bytes that a run may take; more repeats than it holds run in blocks, one by one, and "
-        "no step of a training takes more; null = a quarter of what is free, and 128 MiB for a step",
+        description="memory in bytes that a run may take; what takes more is refused, and no step of a training takes "
+        "more; null = what is free, and 128 MiB for a step",
     )
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
     covariates: Names | None = Field(
@@ -270,9 +257,8 @@ class RunConfig(JobConfig):
             return effects
         for name in effects:
             if name not in EFFECTS:
-                near = nearest(name, tuple(EFFECTS))
-                hint = f"did you mean '{near}'?" if near else f"known are {', '.join(EFFECTS)}"
-                raise ValueError(f"there is no effect '{name}' that a model file can hold; {hint}")
+                near = hint(name, tuple(EFFECTS), "known are")
+                raise ValueError(f"there is no effect '{name}' that a model file can hold; {near}")
         return effects or "none"
 
     @model_validator(mode="after")

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.dataset import Dataset
-from ccnn_torch.calibration.uncertainty import sd_scale
+from ccnn_torch.calibration.statistics import sd_scale
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.records.splits import fold_splits

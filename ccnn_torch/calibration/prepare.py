@@ -16,8 +16,14 @@ from torch import Tensor
 from ccnn_torch.calibration.choice import ModelChoice, choose_model
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.dataset import Dataset, by_repeat, dataset_of
-from ccnn_torch.calibration.effects_search import search_effects, without_frame_drift
-from ccnn_torch.calibration.physics import Physics, fit_physics, frames_of_repeats, verdict_of
+from ccnn_torch.calibration.physics import (
+    Physics,
+    fit_physics,
+    frames_of_repeats,
+    search_effects,
+    verdict_of,
+    without_frame_drift,
+)
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
@@ -316,18 +322,8 @@ def _choice(
     if verdict is not None:
         records, verdict, said = without_frame_drift(mechanism, records, rows, verdict, identify)
         asked, notes = asked and verdict is not None, [*notes, *said]
-    about = (
-        split,
-        config.split.kind,
-        config.seed,
-        settings,
-        config.geometry,
-        verdict,
-        asked,
-        method_names(config, "") == [""],
-        _unlearnable(mechanism, records),
-    )
-    choice = choose_model(mechanism, records, *about)
+    about = (settings, verdict, asked, _unlearnable(mechanism, records))
+    choice = choose_model(config, mechanism, records, split, *about)
     return choice, verdict if choice.effects else None, records, notes
 
 
@@ -378,8 +374,6 @@ def _hash(*tensors: Tensor) -> str:
 # Bytes for a row of a repeat, measured on runs of the tripod: rows, deviations and Jacobians of all kinds; and, of the
 # one method that keeps a population, for each individual.
 _ROW, _INDIVIDUAL = 10_000, 2_500
-# And of the figures of a repeat in the results of all.
-_FIGURES = 10_000
 
 
 def memory_of_run(config: RunConfig, rows: int, joints: int) -> int:
@@ -391,41 +385,24 @@ def memory_of_run(config: RunConfig, rows: int, joints: int) -> int:
     return config.repeats * rows * (of_row + squared)
 
 
-class TooManyRepeatsError(InputError):
-    """All repeats at once take more memory than a run may have; `block` of them do not."""
-
-    def __init__(self, sentence: str, block: int, limit: int) -> None:
-        super().__init__(sentence)
-        self.block, self.limit = block, limit
-
-
 def check_memory(config: RunConfig, rows: int, joints: int) -> list[str]:
-    """Sentences for who starts a run that takes more than half of the free memory.
-
-    A run may take `max_bytes`, by default a quarter of what is free; one repeat may take all that is free.
+    """A sentence for who starts a run that takes more than half of the free memory.
 
     Raises:
-        TooManyRepeatsError: it takes more, and some of its repeats would not.
-        InputError: a repeat alone takes more, or the figures of all; names the keys to lower.
+        InputError: it takes more than `max_bytes`, or than is free; names the keys to lower.
     """
     needed, free = memory_of_run(config, rows, joints), free_memory()
-    limit = config.max_bytes if config.max_bytes is not None else None if free is None else free // 4
-    if limit is None or needed <= limit:
-        return []
-    keys = [f"repeats ({config.repeats})"] if config.repeats > 1 else []
-    keys += [f"ccnn.population ({config.ccnn.population})"] if "ccnn" in method_names(config) else []
-    there = f"max_bytes={config.max_bytes}" if config.max_bytes is not None else f"{free or 0:,} are free"
+    limit = config.max_bytes or free
     told = (
         f"{config.repeats} x {rows} rows (repeats x rows) take about {needed:,} bytes of memory "
-        f"({needed / 1e9:,.1f} GB), and {there}; lower {' or '.join([*keys, 'the number of rows'])}"
+        f"({needed / 1e9:,.1f} GB), and "
+        + (f"{free or 0:,} are free" if config.max_bytes is None else f"max_bytes={config.max_bytes}")
     )
-    each = needed // config.repeats
-    most = limit if config.max_bytes is not None or free is None else free
-    if each > most or config.repeats * _FIGURES > limit:
-        raise InputError(told)
-    if config.repeats > 1:
-        raise TooManyRepeatsError(f"{told}, or take block=…", max(1, limit // each), max(limit, each))
-    return [f"{told} if the run is stopped by the system."] if free is not None and needed > free / 2 else []
+    if limit is not None and needed > limit:
+        keys = [f"repeats ({config.repeats})"] * (config.repeats > 1)
+        keys += [f"ccnn.population ({config.ccnn.population})"] * ("ccnn" in method_names(config))
+        raise InputError(f"{told}; lower {' or '.join([*keys, 'the number of rows'])}")
+    return [f"{told}: the system may stop the run."] if free is not None and needed > free / 2 else []
 
 
 def free_memory() -> int | None:

@@ -13,19 +13,20 @@ from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.dataset import Dataset, Rows, pad_rows
 from ccnn_torch.calibration.early_stop import Plan
 from ccnn_torch.calibration.evaluate import Outcome, pose_with_effects, pose_with_geometry
-from ccnn_torch.calibration.method_choice import Comparison
+from ccnn_torch.calibration.fitting import Comparison
 from ccnn_torch.calibration.physics import Physics
 from ccnn_torch.calibration.prepare import Prepared
 from ccnn_torch.calibration.statistics import (
     before_block,
     constant_errors,
+    coverage,
     floor_block,
+    inside_domain,
     joint_errors,
     pose_block,
     ratio_to_floor,
     spread,
 )
-from ccnn_torch.calibration.uncertainty import coverage, inside_domain
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.report.results.base import Axis, Spread

@@ -67,7 +67,7 @@ def sweep(
     """Run a config with every combination of some keys' values; each job is a run folder of its own.
 
     A second call keeps the finished jobs and runs the others. The folder then holds sweep.csv, with one row a job:
-    its keys, the best method and its held-out errors. With seed=0,10,20 repeats=10 a job is a block of ten seeds.
+    its keys, the best method and its held-out errors. With seed=0,10,20 repeats=10 a job has ten seeds.
 
     Examples:
 

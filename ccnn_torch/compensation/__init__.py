@@ -18,7 +18,11 @@ if TYPE_CHECKING:
         gains as gains,
     )
     from ccnn_torch.compensation.expansions import expand as expand
-    from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
+    from ccnn_torch.compensation.fit import (
+        fit_compensator as fit_compensator,
+        geometric_deviation as geometric_deviation,
+        machine_parts as machine_parts,
+    )
     from ccnn_torch.compensation.machine import Machine as Machine, Rule as Rule, build_machine as build_machine
     from ccnn_torch.compensation.model_files.identified import sign_model as sign_model
     from ccnn_torch.compensation.model_files.load import (
@@ -36,10 +40,6 @@ if TYPE_CHECKING:
         UncertainNetwork as UncertainNetwork,
         network_from_description as network_from_description,
         register_network as register_network,
-    )
-    from ccnn_torch.compensation.parts import (
-        geometric_deviation as geometric_deviation,
-        machine_parts as machine_parts,
     )
     from ccnn_torch.compensation.targets.export import export_model as export_model
 else:

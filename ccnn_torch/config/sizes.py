@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 from ccnn_torch.units import amount
 
 ANGLE_ARM = 0.3
@@ -43,9 +43,7 @@ def sizes_by_name(
     for pattern, value in given.items():
         fits = [i for i, c in enumerate(coordinates) if c.unit == pattern or fnmatchcase(c.name, pattern)]
         if not fits:
-            near = nearest(pattern, names)
-            hint = f"did you mean '{near}'?" if near else f"there are {', '.join(names)}"
-            raise InputError(f"{key}.{pattern}: there is no such name; {hint}")
+            raise InputError(f"{key}.{pattern}: there is no such name; {hint(pattern, names)}")
         for i in fits:
             values[i] = size(value, coordinates[i].unit, f"{key}.{pattern}")
     return values

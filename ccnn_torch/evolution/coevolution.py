@@ -22,10 +22,9 @@ from torch import Tensor
 from ccnn_torch.evolution.genome import (
     BreedingDraws,
     Genome,
-    breed,
+    breed_networks,
     breeding_shapes,
     initial_population,
-    kept,
     select,
     with_elites,
 )
@@ -299,8 +298,8 @@ def advance(state: Coevolution, task: Task, settings: CCNNSettings, seeds: Tenso
     for layer, (population, scores) in enumerate(zip(state.populations, state.fitness, strict=True)):
         taken = sum(len(before) for before in shapes[:layer])
         draws = BreedingDraws(*numbers[taken : taken + len(shapes[layer])])
-        children = breed(population, scores, settings, progress, draws)
-        renewed = with_elites(children, population, scores, state.best[layer], settings)
+        (children,) = breed_networks([population], scores, settings, progress, [draws])
+        renewed = with_elites(children, population, scores, state.best[layer])
         state = _judge(state, layer, renewed, company[:, layer], task)
     return state
 
@@ -330,7 +329,9 @@ def _judge(state: Coevolution, layer: int, population: Genome, company: Tensor, 
         populations=_put(state.populations, layer, population),
         fitness=_put(state.fitness, layer, best_company),
     )
-    return _keep_best(renewed, parts, winner_fitness.squeeze(-1))
+    scores = winner_fitness.squeeze(-1)
+    best, fittest = chosen(scores > state.best_fitness, (tuple(parts), scores), (state.best, state.best_fitness))
+    return replace(renewed, best=best, best_fitness=fittest)
 
 
 def _companions(state: Coevolution, company: Tensor) -> list[Genome]:
@@ -343,22 +344,6 @@ def _companions(state: Coevolution, company: Tensor) -> list[Genome]:
         others = select(population, (company[:, number] * population.mask.shape[1]).long())
         companions.append(joined([best, others], 1))
     return companions
-
-
-def keep_refined(state: Coevolution, refined: Sequence[Genome], scores: Tensor) -> Coevolution:
-    """Write refined networks into the elite where they are fitter than the best joined network.
-
-    Args:
-        refined: parts of complete networks, `r x 1 x ...`; weights without a connection are dropped.
-        scores: their fitness, `r`.
-    """
-    return _keep_best(state, [Genome(g.mask, kept(*g)) for g in refined], scores)
-
-
-def _keep_best(state: Coevolution, networks: Sequence[Genome], scores: Tensor) -> Coevolution:
-    better = scores > state.best_fitness
-    best, fittest = chosen(better, (tuple(networks), scores), (state.best, state.best_fitness))
-    return replace(state, best=best, best_fitness=fittest)
 
 
 def density(populations: Sequence[Genome]) -> Tensor:

@@ -360,13 +360,3 @@ def _pairs(count: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     place = torch.zeros(count, count, dtype=torch.int64, device=device)
     place[rows, columns] = place[columns, rows] = torch.arange(len(rows), device=device)
     return rows, columns, place
-
-
-def dense_jacobian(
-    network: Network, flat: Tensor, inputs: Tensor, targets: Tensor, factor: Tensor | None = None
-) -> Tensor:
-    """Derivative of `residual` with respect to the weights, laid out in full: `b x s x c x k`. Costly; for checks."""
-    flows = _activations(network, flat, inputs)
-    back, inflows = _backward(network, flat, flows, _seed(targets, factor), inputs)
-    parts = [(b.unsqueeze(-1) * f.unsqueeze(-2).unsqueeze(-2)).flatten(-2) for b, f in zip(back, inflows, strict=True)]
-    return torch.cat(parts, dim=-1) * network.active.unsqueeze(1).unsqueeze(1)

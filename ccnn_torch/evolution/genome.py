@@ -76,40 +76,6 @@ def select(genome: Genome, index: Tensor) -> Genome:
     return Genome(pick(genome.mask), pick(genome.weight))
 
 
-def encode(mask: Tensor, weight: Tensor) -> tuple[str, list[float]]:
-    """One individual as strings.
-
-    Args:
-        mask: `out x in`, bool.
-        weight: `out x in`, or `out x (in + 1)` with a bias column.
-
-    Returns:
-        Rows of bits separated by blanks (eqs. 8-10: ``"11 10 11"``), and the weights of the ones.
-    """
-    bits = " ".join("".join("1" if bit else "0" for bit in row) for row in mask.tolist())
-    return bits, weight[active(Genome(mask, weight))].tolist()
-
-
-def decode(bits: str, weights: Sequence[float], bias: bool = False) -> Genome:
-    """Strings back to one individual; inverse of `encode`.
-
-    Raises:
-        ValueError: the rows differ in length, a sign is neither 0 nor 1, or the number of weights is not the number of
-            ones (plus one a row with biases).
-    """
-    rows = bits.split()
-    if not rows or len({len(row) for row in rows}) != 1 or set("".join(rows)) - {"0", "1"}:
-        raise ValueError(f"bits must be rows of 0 and 1 of equal length separated by blanks, got {bits!r}")
-    mask = torch.tensor([[bit == "1" for bit in row] for row in rows])
-    weight = torch.zeros(len(rows), len(rows[0]) + bias, dtype=torch.float64)
-    places = active(Genome(mask, weight))
-    if int(places.sum()) != len(weights):
-        wanted = f"{int(mask.sum())} ones" + (f" and {len(rows)} biases" if bias else "")
-        raise ValueError(f"{len(weights)} weights do not fit the bits {bits!r}: they have {wanted}")
-    weight[places] = torch.tensor(list(weights), dtype=torch.float64)
-    return Genome(mask, weight)
-
-
 def tournament(fitness: Tensor, draws: Tensor) -> Tensor:
     """Tournament selection with replacement.
 
@@ -204,6 +170,8 @@ def nonuniform_mutation(
     return Genome(genome.mask, torch.where(chosen & active(genome), stepped, genome.weight))
 
 
+ELITES = 2
+"""Individuals that survive unchanged: the part of the best joined network, and the next best."""
 # What the paper leaves open and what made no difference on its cases: contestants of one tournament, cut points of a
 # crossover. b of eq. 13 is the paper's.
 CONTESTANTS, CUTS, EXPONENT = 3, 2, 2.0
@@ -231,7 +199,7 @@ class BreedingDraws(NamedTuple):
 
 def breeding_shapes(population: Genome, settings: EvolutionSettings) -> list[tuple[int, ...]]:
     """Shapes of `BreedingDraws` for one repeat."""
-    half = (settings.population - settings.elites + 1) // 2
+    half = (settings.population - ELITES + 1) // 2
     bits, reals = tuple(population.mask.shape[2:]), tuple(population.weight.shape[2:])
     return [
         (2 * half, CONTESTANTS),
@@ -251,19 +219,6 @@ def initial_population(outputs: int, inputs: int, settings: EvolutionSettings, s
     mask = draws[..., :inputs] < settings.density
     weight = (draws[..., inputs:] * 2 - 1) * settings.weight_range
     return Genome(mask, kept(mask, weight))
-
-
-def breed(
-    population: Genome, fitness: Tensor, settings: EvolutionSettings, progress: float, draws: BreedingDraws
-) -> Genome:
-    """Children of one subpopulation, `r x (population - elites) x ...`.
-
-    Args:
-        population: `r x p x ...`.
-        fitness: `r x p`.
-        progress: t / T of eq. 13.
-    """
-    return breed_networks([population], fitness, settings, progress, [draws])[0]
 
 
 def breed_networks(
@@ -307,13 +262,11 @@ def _children(
     first = flip_connections(first, draws.flips < settings.structural_mutation, (draws.fresh * 2 - 1) * limit)
     chosen = (draws.genes < settings.weight_mutation) | weakest_draw(second, draws.genes)
     second = nonuniform_mutation(second, chosen, draws.steps, progress, -limit, limit, EXPONENT)
-    count = settings.population - settings.elites
+    count = settings.population - ELITES
     return mapped(lambda one, other: torch.cat([one, other], 1)[:, :count], first, second)
 
 
-def with_elites(
-    children: Genome, population: Genome, fitness: Tensor, best: Genome, settings: EvolutionSettings
-) -> Genome:
+def with_elites(children: Genome, population: Genome, fitness: Tensor, best: Genome) -> Genome:
     """Elites before the children: the part of the best joined network, then the best of the population.
 
     Individuals as fit as the best of their subpopulation are copies of that part and not taken twice.
@@ -321,9 +274,5 @@ def with_elites(
     Args:
         best: that part, `r x 1 x ...`.
     """
-    parts = [best]
-    if settings.elites > 1:
-        others = fitness.masked_fill(fitness == fitness.amax(-1, keepdim=True), -torch.inf)
-        parts.append(select(population, others.topk(settings.elites - 1, dim=-1).indices))
-    parts.append(children)
-    return joined(parts, 1)
+    others = fitness.masked_fill(fitness == fitness.amax(-1, keepdim=True), -torch.inf)
+    return joined([best, select(population, others.topk(ELITES - 1, dim=-1).indices), children], 1)

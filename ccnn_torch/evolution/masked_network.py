@@ -214,7 +214,7 @@ class MaskedNetwork(nn.Module):
         # A sum over q as a product: engines with a narrow operator list have no other reduction.
         each = torch.eye(outputs, dtype=factors.dtype, device=factors.device)
         self.register_buffer("_sums", each.repeat_interleave(factors.shape[1], 0), persistent=False)
-        self.harmonics = None if harmonics is None else HarmonicSum(harmonics)
+        self.harmonics = harmonics
 
     def describe(self) -> dict[str, Any]:
         """What a model file needs to build the module again, beside its tensors."""
@@ -270,31 +270,6 @@ class MaskedNetwork(nn.Module):
             return signal
         phase = inputs @ self.frequencies.mT
         return torch.cat([signal, torch.sin(phase), torch.cos(phase)], -1)
-
-
-class HarmonicSum(nn.Module):
-    """Harmonics of turning joints as a module: the same sums, from buffers that a model file holds."""
-
-    step: Tensor
-    amplitude: Tensor
-    factors: Tensor
-    owner: Tensor
-
-    def __init__(self, harmonics: Harmonics) -> None:
-        super().__init__()
-        for name, values in vars(harmonics).items():
-            self.register_buffer(name, values.clone())
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """inputs: `... x i` [1]; returns `... x o` [1]."""
-        return self._plain().deviation(inputs)
-
-    def variance(self, inputs: Tensor) -> Tensor:
-        """inputs: `... x i` [1]; returns `... x o` [1]."""
-        return self._plain().variance(inputs)
-
-    def _plain(self) -> Harmonics:
-        return Harmonics(self.step, self.amplitude, self.factors, self.owner)
 
 
 def _blank_harmonics(shape: Sequence[int] | None, outputs: int) -> Harmonics | None:

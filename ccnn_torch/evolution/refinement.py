@@ -14,7 +14,7 @@ the same in steps, with everything that changes in a `RefinementState` of plain 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,27 +25,11 @@ from ccnn_torch.evolution.gauss_newton import Network, linearise, network_of, pr
 from ccnn_torch.evolution.waves import Waves
 from ccnn_torch.numerics.trees import chosen, picked, put
 
-# Calm iterations after which a network is done.
-_CALM = 3
-
-
-@dataclass(frozen=True)
-class RefinementSettings:
-    """How to refine.
-
-    Attributes:
-        iterations: Levenberg-Marquardt iterations.
-        warm_up: iterations before the first estimate of the precisions.
-        tolerance: a network whose objective falls by less than this share in each of three iterations running is done;
-            0 = the objective ends none.
-        patience: iterations without a rise of the log evidence by 1 nat after which a network is done; it ends with
-            the weights and precisions of the highest evidence.
-    """
-
-    iterations: int = 50
-    warm_up: int = 3
-    tolerance: float = 1e-5
-    patience: int = 6
+# A network whose objective falls by less than this share in so many iterations running is done, and one whose log
+# evidence has not risen by 1 nat for so many: it ends with the weights and precisions of the highest evidence.
+_TOLERANCE, _CALM, _PATIENCE = 1e-5, 3, 6
+WARM_UP = 3
+"""Iterations before the first estimate of the precisions."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +46,7 @@ class RefinementProblem:
         leading: the leading dimensions as given.
         group_count: number of prior groups, that last one included.
         wave_groups: which of them are of periodic nodes, int64.
-        settings: as given.
+        warm_up: iterations before the first estimate of the precisions.
     """
 
     network: Network
@@ -74,11 +58,10 @@ class RefinementProblem:
     leading: tuple[int, ...]
     group_count: int
     wave_groups: Tensor
-    settings: RefinementSettings
+    warm_up: int
 
 
-@dataclass(frozen=True)
-class RefinementState:
+class RefinementState(NamedTuple):
     """What changes from iteration to iteration.
 
     Attributes:
@@ -103,15 +86,6 @@ class RefinementState:
     def done(self) -> Tensor:
         """Networks that do not move any more, `b` bool."""
         return self.calm >= _CALM
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """All tensors by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    @classmethod
-    def from_state_dict(cls, state: dict[str, Tensor]) -> RefinementState:
-        """Inverse of `state_dict`."""
-        return cls(**{f.name: state[f.name] for f in fields(cls)})
 
 
 class SecondOrder(NamedTuple):
@@ -198,10 +172,11 @@ def refine(
     inputs: Tensor,
     targets: Tensor,
     row_weights: Tensor,
-    settings: RefinementSettings | None = None,
+    iterations: int = 50,
     row_metric: Tensor | None = None,
     waves: Waves | None = None,
     known: Precisions | None = None,
+    warm_up: int = WARM_UP,
 ) -> Refined:
     """Refine the weights of masked sigmoid networks with linear output; masks stay as they are.
 
@@ -214,7 +189,7 @@ def refine(
         inputs: `... x s x i`, about in [-1, 1].
         targets: `... x s x o`, of about unit deviation.
         row_weights: `... x s`; 0 leaves a row out, even with NaN.
-        settings: defaults where None.
+        iterations: Levenberg-Marquardt iterations, at most.
         row_metric: `... x s x c x o`: the residual of a row is this matrix times (output - target), so that errors
             are judged in other channels than the outputs' own, as the pose error that joint deviations cause.
         waves: periodic nodes `... x k`, whose columns are last in the output's mask and weights; their frequencies
@@ -223,21 +198,19 @@ def refine(
 
     Leading dimensions of all arguments broadcast against each other.
     """
-    settings = settings or RefinementSettings()
-    if known is not None:
-        settings = replace(settings, warm_up=0)
-    problem = pose_refinement(masks, weights, inputs, targets, row_weights, settings, row_metric, waves)
+    warm_up = warm_up if known is None else 0
+    problem = pose_refinement(masks, weights, inputs, targets, row_weights, row_metric, waves, warm_up)
     state = best = start = start_refinement(problem, weights, waves, known)
     highest = torch.full_like(state.damping, -torch.inf)
     stale = torch.zeros_like(state.calm)
-    for _ in range(problem.settings.iterations):
-        going = torch.nonzero(~state.done & (stale < problem.settings.patience)).flatten()
+    for _ in range(iterations):
+        going = torch.nonzero(~state.done & (stale < _PATIENCE)).flatten()
         if len(going) == 0:
             break
         # Networks do not know of each other, so that those which are done need not be worked on for the others' sake.
         part, now = part_of_problem(problem, going), picked(state, going)
         local = second_order(part, now)
-        if int(state.iteration) > problem.settings.warm_up:
+        if int(state.iteration) > warm_up:
             evidence = log_evidence(part, now, local)
             risen = evidence > highest[going]
             best = put(best, going, chosen(risen, now, picked(best, going)))
@@ -249,9 +222,9 @@ def refine(
         # The last one has not been judged; re-estimated precisions may have taken it downhill.
         last = log_evidence(problem, state)
         worse = torch.nonzero(~(last >= highest) & (highest > -torch.inf)).flatten()
-        state = replace(put(state, worse, picked(best, worse)), iteration=state.iteration)
+        state = put(state, worse, picked(best, worse))._replace(iteration=state.iteration)
     worse = ~(_objective(problem, state, state.weights) <= _objective(problem, state, start.weights))
-    state = replace(state, weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
+    state = state._replace(weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
     return finish_refinement(problem, state)
 
 
@@ -261,9 +234,9 @@ def pose_refinement(
     inputs: Tensor,
     targets: Tensor,
     row_weights: Tensor,
-    settings: RefinementSettings | None = None,
     row_metric: Tensor | None = None,
     waves: Waves | None = None,
+    warm_up: int = WARM_UP,
 ) -> RefinementProblem:
     """The fixed part of a refinement; arguments as in `refine`."""
     metrics = [] if row_metric is None else [row_metric.shape[:-3]]
@@ -275,7 +248,6 @@ def pose_refinement(
         row_weights.shape[:-1],
         *metrics,
     )
-    settings = settings or RefinementSettings()
     rows = _flatten(row_weights, leading, 1)
     there = rows > 0
     bias = weights[0].shape[-1] == masks[0].shape[-1] + 1
@@ -298,7 +270,7 @@ def pose_refinement(
         leading=leading,
         group_count=int(groups.max()) + (1 if bias or slots else 2),
         wave_groups=wave_groups(int(groups.max()), masks[-1].shape[-2], slots),
-        settings=settings,
+        warm_up=warm_up,
     )
 
 
@@ -327,12 +299,11 @@ def start_refinement(
         # Counted by the host, which need not wait to read it.
         iteration=torch.zeros((), dtype=torch.int64, device="cpu"),
     )
-    state = replace(state, noise=_noise(problem, state))
+    state = state._replace(noise=_noise(problem, state))
     if known is None:
         return state
     prior, noise, damping = known
-    return replace(
-        state,
+    return state._replace(
         prior=torch.where(prior > 0, prior, state.prior),
         noise=torch.where(noise > 0, noise, state.noise),
         damping=torch.where(damping > 0, damping, state.damping),
@@ -369,14 +340,13 @@ def step_refinement(
         todo = todo[~good]
         if len(todo) == 0:
             break
-    moved = replace(
-        state,
+    moved = state._replace(
         weights=weights,
         damping=damping.clamp(*_DAMPING_RANGE),
-        calm=torch.where(before - reached < problem.settings.tolerance * before, state.calm + 1, 0),
+        calm=torch.where(before - reached < _TOLERANCE * before, state.calm + 1, 0),
         iteration=state.iteration + 1,
     )
-    if int(moved.iteration) <= problem.settings.warm_up:
+    if int(moved.iteration) <= problem.warm_up:
         return moved
     return _estimate_precisions(problem, moved, known)
 
@@ -481,12 +451,11 @@ def _estimate_precisions(problem: RefinementProblem, state: RefinementState, kno
     prior = ((effective + 2 * shape) / (squares + 2 * rate)).clamp(*_PRECISION_RANGE)
     prior[:, -1] = _PRECISION_RANGE[0]
     usable = ((failed == 0) & effective.isfinite().all(-1)).unsqueeze(-1)
-    estimated = replace(
-        state,
+    estimated = state._replace(
         prior=torch.where(usable, prior, state.prior),
         effective=torch.where(usable, effective, state.effective),
     )
-    return replace(estimated, noise=_noise(problem, estimated))
+    return estimated._replace(noise=_noise(problem, estimated))
 
 
 def _flatten(tensor: Tensor, leading: tuple[int, ...], trailing: int) -> Tensor:

@@ -18,12 +18,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 # Inputs span 2, so that a wave of frequency pi has one period. Slower ones are left to the sigmoids.
 _SLOWEST, _FASTEST = 4.0, 130.0
@@ -176,8 +175,7 @@ _DIRECTIONS = 32
 _SWITCHED_OFF = 1e-4
 
 
-@dataclass(frozen=True)
-class Harmonics:
+class Harmonics(nn.Module):
     """Fourier series of `a` turning joints, `k` harmonics each; their angles are the last `a` features.
 
     Attributes:
@@ -192,12 +190,17 @@ class Harmonics:
     factors: Tensor
     owner: Tensor
 
+    def __init__(self, step: Tensor, amplitude: Tensor, factors: Tensor, owner: Tensor) -> None:
+        super().__init__()
+        for name, values in (("step", step), ("amplitude", amplitude), ("factors", factors), ("owner", owner)):
+            self.register_buffer(name, values.clone())
+
     def repeat(self, index: int) -> Harmonics:
         """Those of one repeat, without the leading dimension."""
         return Harmonics(self.step[index], self.amplitude[index], self.factors[index], self.owner)
 
-    def deviation(self, inputs: Tensor) -> Tensor:
-        """inputs: `... x s x i` [1]; returns `... x s x o` [1]."""
+    def forward(self, inputs: Tensor) -> Tensor:
+        """The deviation. inputs: `... x s x i` [1]; returns `... x s x o` [1]."""
         # Sums as products: engines with a narrow operator list have no other reduction.
         each = self._basis(inputs) @ self.amplitude.unsqueeze(-3).unsqueeze(-1)
         return each[..., 0, 0] @ self.owner

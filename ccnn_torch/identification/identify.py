@@ -249,5 +249,5 @@ def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, de
         )
 
 
-IDENTIFY = FolderJob("ccnn identify", IdentifyConfig, RESULTS, "methods/*.safetensors", lambda c: (c, None), _run)
+IDENTIFY = FolderJob("ccnn identify", IdentifyConfig, RESULTS, "methods/*.safetensors", lambda c: None, _run)
 """A config to a finished folder; `MethodFailedError` where all is written, but the first method did not converge."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.refinement import (
-    RefinementSettings,
     RefinementState,
     log_evidence,
     part_of_problem,
@@ -20,7 +20,7 @@ from ccnn_torch.evolution.refinement import (
     start_refinement,
     step_refinement,
 )
-from ccnn_torch.evolution.settings import check_least
+from ccnn_torch.evolution.settings import STRICT, Above, Count, Widths
 from ccnn_torch.learners.protocol import TrainingData, weighted_mse
 from ccnn_torch.learners.rows import OneNetwork, usable_rows
 from ccnn_torch.numerics.trees import picked, put
@@ -28,7 +28,7 @@ from ccnn_torch.numerics.trees import picked, put
 _STARTS = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class BPLMSettings:
     """Settings of BP-LM; the paper gives none of its own.
 
@@ -45,19 +45,11 @@ class BPLMSettings:
         ValueError: a value out of its range, in one sentence with the key.
     """
 
-    hidden: tuple[int, ...] = (20,)
-    restarts: int = 6
-    iterations: int = 60
-    tolerance: float = 1e-3
-    patience: int = 3
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden", tuple(self.hidden))
-        if not self.hidden or not all(width >= 1 for width in self.hidden):
-            raise ValueError(f"hidden={list(self.hidden)}: at least one hidden layer, each with at least one node")
-        check_least(self, restarts=1, iterations=1, patience=1)
-        if not 0 < self.tolerance < math.inf:
-            raise ValueError(f"tolerance={self.tolerance} must be above 0")
+    hidden: Annotated[Widths, Field(min_length=1)] = (20,)
+    restarts: Count = 6
+    iterations: Count = 60
+    tolerance: Above = 1e-3
+    patience: Count = 3
 
 
 class BPLM(OneNetwork):
@@ -99,7 +91,6 @@ class BPLM(OneNetwork):
             data.inputs.unsqueeze(1),
             data.targets.unsqueeze(1),
             data.weights.unsqueeze(1),
-            RefinementSettings(iterations=self.settings.iterations),
             None if data.metric is None else data.metric.unsqueeze(1),
         )
         self._state = start_refinement(self._problem, weights)
@@ -160,7 +151,7 @@ class BPLM(OneNetwork):
         known = {"log_evidence": self._evidence, "rest": self._rest, "iterations_made": self._iterations}
         tensors = {
             name: self._apart(value) if value.dim() else value
-            for name, value in (self._state.state_dict() | known).items()
+            for name, value in (self._state._asdict() | known).items()
         }
         return tensors | {"best": self._best, "best_evidence": self._best_evidence}
 
@@ -168,7 +159,7 @@ class BPLM(OneNetwork):
         """Take back a state; call `start` with the same data first."""
         self._best, self._best_evidence = state["best"], state["best_evidence"]
         flat = {name: value.flatten(0, 1) if value.dim() > 1 else value for name, value in state.items()}
-        self._state = RefinementState.from_state_dict(flat)
+        self._state = RefinementState(*(flat[name] for name in RefinementState._fields))
         self._evidence, self._rest, self._iterations = (flat[k] for k in ("log_evidence", "rest", "iterations_made"))
         self._known = second_order(self._problem, self._state)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.coevolution import EPSILON, REPRESENTATIVES, density, diversity, make_task
+from ccnn_torch.evolution.coevolution import REPRESENTATIVES, density, diversity, make_task
 from ccnn_torch.evolution.masked_network import MaskedNetwork, Spread, readout_spread, spread_variance
 from ccnn_torch.evolution.network import averaged, forward, without_waves
 from ccnn_torch.evolution.random import member_seeds
@@ -61,7 +61,7 @@ class CCNN:
         self._gears = _gears(data, settings)
         if self._gears is not None:
             there = (data.weights > 0).unsqueeze(-1)
-            left = data.targets - self._gears.deviation(data.inputs)
+            left = data.targets - self._gears(data.inputs)
             data = replace(data, targets=torch.where(there, left, data.targets))
         inputs, targets, weights = (
             part.repeat_interleave(members, dim=0) for part in (data.inputs, data.targets, data.weights)
@@ -103,7 +103,7 @@ class CCNN:
 
     @property
     def finished(self) -> bool:
-        """True after the last generation (or once every coevolution has reached the target error) and refinement."""
+        """True after the last generation and refinement."""
         return self._evolved and self._phase >= self._phases
 
     @property
@@ -114,7 +114,7 @@ class CCNN:
     def predict(self, inputs: Tensor) -> Tensor:
         """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
         output = self._remainder(inputs)
-        return output if self._gears is None else output + self._gears.deviation(inputs)
+        return output if self._gears is None else output + self._gears(inputs)
 
     def _remainder(self, inputs: Tensor) -> Tensor:
         """What the networks say, without the harmonics."""
@@ -138,21 +138,10 @@ class CCNN:
     def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`.
 
-        Its periodic nodes are left out; `waves` has them.
+        Its periodic nodes are left out.
         """
         plain = averaged(without_waves(self._structure(repeat).members()))
         return [mask[repeat] for mask in plain.masks], [weight[repeat] for weight in plain.weights]
-
-    def waves(self, repeat: int) -> list[tuple[int, float, Tensor]]:
-        """Periodic nodes of one repeat's model: input, frequency [rad per unit of the feature], amplitudes `o` [1]."""
-        model = self._structure(repeat).members()
-        slots, readout = model.slots, model.weights[-1][repeat]
-        end = model.masks[-1].shape[-1]
-        sines, cosines = readout[..., end - 2 * slots : end - slots], readout[..., end - slots : end]
-        amplitude = torch.hypot(sines, cosines).mean(0)
-        frequency = model.waves.frequency[repeat].mean(0)
-        used = torch.nonzero(frequency).flatten().tolist()
-        return [(int(model.waves.source[repeat, 0, k]), float(frequency[k]), amplitude[:, k]) for k in used]
 
     def network(self, repeat: int) -> MaskedNetwork:
         """The model of one repeat, pruned of its dead nodes."""
@@ -201,11 +190,7 @@ class CCNN:
 
     @property
     def _evolved(self) -> bool:
-        settings = self.settings
-        states = [structure.state for structure in self._structures]
-        errors = torch.stack([1 / state.best_fitness - EPSILON for state in states])
-        reached = settings.target_error > 0 and bool((errors <= settings.target_error).all())
-        return reached or states[0].generation >= settings.generations
+        return self._structures[0].state.generation >= self.settings.generations
 
     @property
     def _phases_each(self) -> int:

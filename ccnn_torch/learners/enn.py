@@ -7,7 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.coevolution import EPSILON, density, diversity, fitness, make_task, network_errors
+from ccnn_torch.evolution.coevolution import density, diversity, fitness, make_task, network_errors
 from ccnn_torch.evolution.genome import (
     BreedingDraws,
     breed_networks,
@@ -72,7 +72,7 @@ class ENN(OneNetwork):
         progress = self._generation / settings.generations
         children = breed_networks(self._layers, self._fitness, settings, progress, draws)
         self._layers = [
-            with_elites(new, old, self._fitness, best, settings)
+            with_elites(new, old, self._fitness, best)
             for new, old, best in zip(children, self._layers, self._best, strict=True)
         ]
         self._judge()
@@ -88,11 +88,8 @@ class ENN(OneNetwork):
 
     @property
     def finished(self) -> bool:
-        """True after the last generation, or once every repeat has reached the target error."""
-        settings = self.settings
-        error = 1 / self._best_fitness - EPSILON
-        reached = settings.target_error > 0 and bool((error <= settings.target_error).all())
-        return reached or self._generation >= settings.generations
+        """True after the last generation."""
+        return self._generation >= self.settings.generations
 
     @property
     def steps(self) -> int:

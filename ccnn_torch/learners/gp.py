@@ -7,15 +7,23 @@ with its early stopping and its checkpoints. scikit-learn's `fit` is one process
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated
 
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
-from ccnn_torch.evolution.settings import check_least
-from ccnn_torch.learners.gaussian_process import Evidence, GPNetwork, covariance, log_evidence, spread_factor
+from ccnn_torch.evolution.settings import STRICT, Count, Some
+from ccnn_torch.learners.gaussian_process import (
+    NOISE_FLOOR,
+    Evidence,
+    GPNetwork,
+    covariance,
+    log_evidence,
+    spread_factor,
+)
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import taken, usable_rows
 from ccnn_torch.numerics.blocks import block_size
@@ -27,8 +35,8 @@ _CHUNK = 1 << 18
 _COPIES = 12
 # Steps between two checks of whether the likelihood still rises.
 _LOOK = 5
-# The largest and the smallest first step [nats of a hyperparameter's logarithm]; no later one is larger.
-_STEP_SIZES = (1e-4, 1.0)
+# First step in the logarithms of the hyperparameters, the smallest slope that it is a share of, and the largest step.
+_FIRST_STEP, _FLATTEST, _LARGEST_STEP = 0.1, 1e-4, 1.0
 # Share of the rise that the slope promises which a step must bring (Armijo's condition; Nocedal and Wright, "Numerical
 # Optimization", 2006, eq. 3.4), and what shortens the next trial where it does not.
 _PROMISED, _SHORTER = 1e-4, 0.3
@@ -39,50 +47,28 @@ _SMOOTH, _NOISY = 0.7, -3.0
 _ORDER_STREAM = 71
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class GPSettings:
     """Settings of the Gaussian process.
 
     Attributes:
-        kernel: matern32, matern52 or rbf, each with one length scale an input. On a UR10 the first has the highest
-            marginal likelihood, validation errors are 0.068, 0.068 and 0.143; on the tripod they are alike.
         steps: steps of the search for the hyperparameters, at most; each costs one marginal likelihood and its slope.
-        learning_rate: first step in the logarithms of the hyperparameters; the search finds its own from there.
         tolerance: an output's search ends once five steps raised its log marginal likelihood by less than this.
         hyperparameter_rows: training rows, drawn at random where there are more, that the marginal likelihood sees; its
             cost grows with their cube. Predictions before the last step condition on the same rows.
         max_rows: training rows that the final predictions condition on, drawn at random where there are more.
         variance_rows: training rows that predictive variances condition on; fewer than all give an upper bound, and a
             model file holds a matrix of this size for each output.
-        noise_floor: smallest variance of the noise, as a share of the variance of an output; keeps matrices regular.
 
     Raises:
         ValueError: a value out of its range, in one sentence with the key.
     """
 
-    kernel: Literal["matern32", "matern52", "rbf"] = "matern32"
-    steps: int = 100
-    learning_rate: float = 0.1
-    tolerance: float = 0.01
-    hyperparameter_rows: int = 600
-    max_rows: int = 3000
-    variance_rows: int = 256
-    noise_floor: float = 1e-6
-
-    def __post_init__(self) -> None:
-        check_least(self, steps=1, hyperparameter_rows=2, max_rows=2, variance_rows=1)
-        if self.max_rows < self.hyperparameter_rows:
-            raise ValueError(
-                f"max_rows={self.max_rows} must be at least hyperparameter_rows={self.hyperparameter_rows}"
-            )
-        if self.variance_rows > 512:
-            raise ValueError(f"variance_rows={self.variance_rows} must be at most 512: model files hold its square")
-        if not _STEP_SIZES[0] <= self.learning_rate <= _STEP_SIZES[1]:
-            raise ValueError(f"learning_rate={self.learning_rate} must be from {_STEP_SIZES[0]} to {_STEP_SIZES[1]:g}")
-        if not self.tolerance >= 0:
-            raise ValueError(f"tolerance={self.tolerance} must not be negative")
-        if not 1e-10 <= self.noise_floor < 1:
-            raise ValueError(f"noise_floor={self.noise_floor} must be at least 1e-10 and below 1")
+    steps: Count = 100
+    tolerance: Annotated[float, Field(ge=0)] = 0.01
+    hyperparameter_rows: Some = 600
+    max_rows: Some = 3000
+    variance_rows: Annotated[int, Field(ge=1, le=512)] = 256
 
 
 def bfgs(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
@@ -179,12 +165,12 @@ class GaussianProcess:
 
     def step(self) -> dict[str, Tensor]:
         """One marginal likelihood of every output whose search has not ended, and the next trial of BFGS."""
-        state, settings = self._state, self.settings
+        state = self._state
         weights = self._weights[:, : self._few]
         going = ~state["done"]
         for rows, outputs in self._chunks(going):
             few = self._rows[rows, : self._few], self._targets[rows, outputs, : self._few], weights[rows]
-            found = log_evidence(settings.kernel, settings.noise_floor, state["theta"][rows, outputs], *few)
+            found = log_evidence(state["theta"][rows, outputs], *few)
             error = (found.residual.square() * few[2]).sum(-1) / few[2].sum(-1)
             self._climb(rows, outputs, found, error)
         state["evaluations"] += going.any(1)
@@ -212,13 +198,13 @@ class GaussianProcess:
         taken &= first | (found.value >= best + _PROMISED * (slope * step).sum(-1))
         inverse = torch.where((taken & ~first)[:, None, None], bfgs(inverse, step, slope - found.slope), inverse)
         # So long as nothing is known of the curvature: the steepest way, with a first step of this size.
-        steep = self.settings.learning_rate / found.slope.abs().amax(-1).clamp_min(_STEP_SIZES[0])
+        steep = _FIRST_STEP / found.slope.abs().amax(-1).clamp_min(_FLATTEST)
         inverse = torch.where((taken & first)[:, None, None], torch.diag_embed(steep.unsqueeze(-1) + 0 * step), inverse)
         slope = torch.where(taken.unsqueeze(-1), found.slope, slope)
         best_theta = torch.where(taken.unsqueeze(-1), theta, best_theta)
         length = torch.where(taken, 1.0, _SHORTER * length)
         way = (inverse @ slope.unsqueeze(-1)).squeeze(-1)
-        way = way / (way.abs().amax(-1, keepdim=True) / _STEP_SIZES[1]).clamp_min(1.0)
+        way = way / (way.abs().amax(-1, keepdim=True) / _LARGEST_STEP).clamp_min(1.0)
         next_theta = best_theta + length.unsqueeze(-1) * way
         values = next_theta, best_theta, torch.where(taken, found.value, best), slope, inverse, length
         for name, value in zip(names, values, strict=True):
@@ -299,18 +285,17 @@ class GaussianProcess:
         """Length scales `r x o x i`, variances of function and noise and the mean, `r x o` each, of the model."""
         theta, known = self._state["best_theta"], self._state["best"] > -torch.inf
         length_scale, (output_scale, noise, constant) = theta[..., :-3].exp(), theta[..., -3:].unbind(-1)
-        floor = self.settings.noise_floor
         return (
             length_scale,
             torch.where(known, output_scale.exp(), 0.0),
-            torch.where(known, noise.exp() + floor, self._variance + floor),
+            torch.where(known, noise.exp() + NOISE_FLOOR, self._variance + NOISE_FLOOR),
             torch.where(known, constant, self._mean),
         )
 
     def _network(self, repeat: int, dual: Tensor, spread: Tensor) -> GPNetwork:
         rows = self._rows[repeat, : dual.shape[-1]]
         parts = (dual, spread, *self._model())
-        return GPNetwork(self.settings.kernel, rows, *(part[repeat] for part in parts))
+        return GPNetwork(rows, *(part[repeat] for part in parts))
 
     def _by_repeat(
         self, inputs: Tensor, dual: Tensor, spread: Tensor, ask: Callable[[GPNetwork, Tensor], Tensor]
@@ -355,7 +340,7 @@ class GaussianProcess:
             both = there[repeat].unsqueeze(-1) & there[repeat]
             for output in range(o):
                 scales = length_scale[repeat, output], output_scale[repeat, output]
-                kernel = covariance(self.settings.kernel, inputs[repeat], *scales)
+                kernel = covariance(inputs[repeat], *scales)
                 noises = torch.where(there[repeat], noise[repeat, output] / weights[repeat], 1.0)
                 found.append(make(repeat, output, torch.where(both, kernel, 0.0) + torch.diag(noises)))
         return torch.stack(found).reshape(r, o, *found[0].shape)

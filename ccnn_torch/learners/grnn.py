@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
-from ccnn_torch.evolution.settings import check_least
+from ccnn_torch.evolution.settings import STRICT, Count, Some
 from ccnn_torch.learners.grnn_network import FARTHEST, GRNNNetwork, KernelMeans, KernelVariance, blocked_means
 from ccnn_torch.learners.protocol import TrainingData, weighted_mse
 from ccnn_torch.learners.rows import taken, usable_rows
 
 # Streams of random numbers: which rows are judged, and the moves of each step.
 _ROWS, _MOVES = 0, 1
+# Bandwidths of the first step go from the one to the other, geometrically, besides an infinite one, which is the mean;
+# features are in -1 .. 1.
+_NARROWEST, _WIDEST = 0.02, 5.0
+# Factor by which a bandwidth first moves; its root is taken each time that no move was better.
+_FIRST_MOVE = 2.0
 # The search has converged once the factor of a move is below this: leave-one-out is flat at its lowest.
 _SMALLEST_MOVE = 1.05
 # Standard errors by which the best bandwidths must beat the mean of all rows, row by row in leave-one-out, to be used
@@ -24,7 +29,7 @@ _SMALLEST_MOVE = 1.05
 _CAUTION = 1.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class GRNNSettings:
     """Settings of the GRNN; the paper gives none of its own.
 
@@ -32,9 +37,6 @@ class GRNNSettings:
         iterations: steps at most. The first judges one bandwidth for all inputs, each further one moves around the
             best so far; 30 suffice for a dozen inputs, and the search ends earlier once its moves are small.
         candidates: bandwidth vectors judged in one step, all in one batch; never fewer than three for each input.
-        narrowest, widest: bandwidths of the first step go from the one to the other, geometrically, besides an
-            infinite one, which is the mean; features are in -1 .. 1.
-        move: factor by which a bandwidth first moves; its root is taken each time that no move was better.
         queries: rows that leave-one-out judges, drawn once by seed where there are more. Bandwidth vectors are
             compared on the same rows, so that 500 distinguish them as well as all would.
         references: rows that they are predicted from, drawn likewise; the bandwidths are then narrowed by
@@ -44,22 +46,10 @@ class GRNNSettings:
         ValueError: a value out of its range, in one sentence with the key.
     """
 
-    iterations: int = 30
-    candidates: int = 32
-    narrowest: float = 0.02
-    widest: float = 5.0
-    move: float = 2.0
-    queries: int = 500
-    references: int = 2000
-
-    def __post_init__(self) -> None:
-        check_least(self, iterations=1, candidates=2, queries=2, references=2)
-        if not 0 < self.narrowest < self.widest < math.inf:
-            raise ValueError(f"narrowest={self.narrowest} must be above 0 and below widest={self.widest}")
-        if self.references < self.queries:
-            raise ValueError(f"references={self.references} must be at least queries={self.queries}")
-        if not 1 < self.move < math.inf:
-            raise ValueError(f"move={self.move} is a factor: write a number above 1")
+    iterations: Count = 30
+    candidates: Some = 32
+    queries: Some = 500
+    references: Some = 2000
 
 
 class GRNN:
@@ -95,10 +85,10 @@ class GRNN:
         count = rows.weights.shape[1]
         keys = uniform(self._seeds, _ROWS, 0, (count,)) + (rows.weights == 0)
         self._judged = taken(rows, keys.argsort(-1)[:, : self.settings.references])
-        self._own = torch.arange(min(self.settings.queries, count), device=keys.device)
+        self._own = torch.arange(min(self.settings.queries, self.settings.references, count), device=keys.device)
         repeats, width = len(data.seeds), data.inputs.shape[-1]
         self._inverse = rows.inputs.new_zeros(repeats, width)
-        self._move = rows.inputs.new_full((repeats,), self.settings.move)
+        self._move = rows.inputs.new_full((repeats,), _FIRST_MOVE)
         self._of_mean = self._squares(self._inverse.unsqueeze(1))
         self._error = self._mean_of_rows(self._of_mean)[:, 0]
         self._trusted = torch.zeros_like(data.seeds, dtype=torch.bool)
@@ -139,10 +129,6 @@ class GRNN:
     def steps(self) -> int:
         """Steps at most."""
         return self.settings.iterations
-
-    def bandwidths(self) -> Tensor:
-        """Of the model, `r x i` [1]; infinite for an input that is switched off."""
-        return 1 / self._narrowed(self._model())
 
     def predict(self, inputs: Tensor) -> Tensor:
         """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
@@ -192,20 +178,18 @@ class GRNN:
 
     def _grid(self) -> Tensor:
         """One bandwidth for all inputs, `r x c x i` (1 / h)."""
-        settings = self.settings
-        powers = torch.linspace(0, 1, settings.candidates, dtype=torch.float64, device=self._inverse.device)
-        inverse = (settings.widest / settings.narrowest) ** powers / settings.widest
+        powers = torch.linspace(0, 1, self.settings.candidates, dtype=torch.float64, device=self._inverse.device)
+        inverse = (_WIDEST / _NARROWEST) ** powers / _WIDEST
         repeats, width = self._inverse.shape
         return inverse.view(1, -1, 1).expand(repeats, -1, width)
 
     def _moves(self) -> Tensor:
         """Neighbours of the best bandwidths, `r x c x i` (1 / h)."""
-        settings, best = self.settings, self._inverse.unsqueeze(1)
+        best = self._inverse.unsqueeze(1)
         width = self._inverse.shape[-1]
         count, structured = self._move_count, 3 * width
         draws = uniform(self._seeds, _MOVES, int(self._step), (2, count, width))
-        log_range = math.log(settings.widest / settings.narrowest)
-        fresh = torch.exp(log_range * draws[:, 0]) / settings.widest
+        fresh = torch.exp(math.log(_WIDEST / _NARROWEST) * draws[:, 0]) / _WIDEST
         # Each input alone: narrower, wider, off; where it is off: three fresh bandwidths.
         alone = torch.eye(width, dtype=torch.bool, device=best.device)
         factor = torch.stack([self._move, 1 / self._move, torch.zeros_like(self._move)], -1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from typing import cast
 
@@ -15,6 +14,7 @@ from ccnn_torch.learners.gp import GaussianProcess
 from ccnn_torch.learners.grnn import GRNN
 from ccnn_torch.learners.protocol import Learner, missing_verbs
 from ccnn_torch.plugins import is_plugin, load_plugin
+from ccnn_torch.spelling import hint
 
 LEARNERS: dict[str, Callable[..., Learner]] = {
     "ccnn": CCNN,
@@ -46,7 +46,6 @@ def make_learner(name: str, settings: object = None) -> Learner:
             )
         return cast(Learner, learner)
     if name not in LEARNERS:
-        near = difflib.get_close_matches(name, LEARNERS, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"methods: {name!r} is no learner of this version, which has {', '.join(LEARNERS)}{hint}")
+        near = hint(name, [*LEARNERS], "it has")
+        raise InputError(f"methods: '{name}' is no learner of this version; {near}")
     return LEARNERS[name]() if settings is None else LEARNERS[name](settings)

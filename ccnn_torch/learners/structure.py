@@ -8,11 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.coevolution import Coevolution, Task, advance, fitness, joined_errors, keep_refined, start
+from ccnn_torch.evolution.coevolution import Coevolution, Task, advance, start
 from ccnn_torch.evolution.gauss_newton import prior_groups, resized_prior
-from ccnn_torch.evolution.genome import Genome, genomes_of, named_genomes
-from ccnn_torch.evolution.network import Bundle, averaged, forward, resized, without_waves
-from ccnn_torch.evolution.refinement import Precisions, RefinementSettings, refine
+from ccnn_torch.evolution.genome import genomes_of, named_genomes
+from ccnn_torch.evolution.network import Bundle, averaged, forward, resized
+from ccnn_torch.evolution.refinement import Precisions, refine
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves
 from ccnn_torch.numerics.blocks import blocks
@@ -92,19 +92,15 @@ class Structure:
         self._searched = True
 
     def evolve(self) -> None:
-        """One generation, and a refinement that is written back into the elite where one is due."""
-        settings = self.settings
+        """One generation."""
         if self._first is not None and bool((self._first[-1] > -torch.inf)[self._going].all()):
             # Nobody asks for what would evolve.
             self.state = replace(self.state, generation=self.state.generation + 1)
             return
-        self.state = advance(self.state, self.rows.task, settings, self.rows.seeds)
-        every = settings.refine_every
-        if settings.refinement_iterations and every and self.state.generation % every == 0:
-            self.refine()
+        self.state = advance(self.state, self.rows.task, self.settings, self.rows.seeds)
 
     def refine(self) -> None:
-        """Refine the best joined network of every member, keep it by evidence, and write it back where it is fitter."""
+        """Refine the best joined network of every member, and keep it by evidence."""
         index = torch.nonzero(self._going).flatten()
         if len(index) == 0:
             return
@@ -115,15 +111,6 @@ class Structure:
             known = picked(precisions, index)
         candidate, evidence, precisions = self._descend(picked(model, index), index, known)
         self._take(index, candidate, evidence, precisions, evidence > self.evidence[index])
-        if self._first is not None:
-            return
-        plain = without_waves(candidate)
-        genomes = tuple(
-            Genome(mask.unsqueeze(1), weight.unsqueeze(1))
-            for mask, weight in zip(plain.masks, plain.weights, strict=True)
-        )
-        errors = joined_errors(0, genomes[0], genomes, self.rows.task)[:, 0, 0]
-        self.state = keep_refined(self.state, genomes, fitness(errors))
 
     def search_waves(self) -> None:
         """Look for periodic nodes in what the kept members of a repeat leave, and refine those that got any."""
@@ -254,7 +241,7 @@ class Structure:
             rows.inputs,
             rows.targets,
             rows.weights,
-            RefinementSettings(iterations=self.iterations),
+            self.iterations,
             rows.metric,
             small.waves,
             known and known._replace(prior=resized_prior(known.prior, outputs, self.slots, used)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -30,6 +29,7 @@ from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_f
 from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 from ccnn_torch.plugins import class_hint, code_refused, file_that_names, is_plugin, load_plugin, users_code
+from ccnn_torch.spelling import hint
 
 _POSES, _STEPS = 256, 8
 # A walk whose joints change by more than this in a step, or that differs by less from the direct answer, is not
@@ -375,9 +375,8 @@ def _maker(spec: str) -> Callable[..., Any]:
         return functools.partial(reader, spec)
     if Path(spec).suffix == ".py":
         raise InputError(class_hint(spec))
-    near = difflib.get_close_matches(spec, REGISTRY, 1)
-    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(REGISTRY)}."
-    raise InputError(f"unknown mechanism '{spec}'; {hint} Otherwise give {_FORMS}")
+    near = hint(spec, [*REGISTRY], "known:", ".")
+    raise InputError(f"unknown mechanism '{spec}'; {near} Otherwise give {_FORMS}")
 
 
 def _call(spec: str, maker: Callable[..., Any], keys: Mapping[str, Any]) -> Any:

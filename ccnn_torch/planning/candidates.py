@@ -17,7 +17,7 @@ from ccnn_torch.identification.problems.problem import Problem, Progress
 from ccnn_torch.mechanisms import Instrument, Mechanism
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.records.commanded import SECOND
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 
 Limits = Mapping[str, tuple[float, float]]
 
@@ -159,9 +159,8 @@ def _bounds(mechanism: Mechanism, limits: Limits) -> Tensor:
     seconds = {f"{name}{SECOND}": ends for name, ends in limits.items() if f"{name}{SECOND}" in names}
     for name, (low, high) in {**seconds, **limits}.items():
         if name not in names:
-            near = nearest(name, names)
-            hint = f"did you mean '{near}'?" if near else f"it has {', '.join(names)}"
-            raise InputError(f"limits: mechanism '{mechanism.name}' has no joint or pose coordinate '{name}'; {hint}")
+            near = hint(name, names, "it has")
+            raise InputError(f"limits: mechanism '{mechanism.name}' has no joint or pose coordinate '{name}'; {near}")
         if not low < high:
             raise InputError(f"limits.{name}: the first number must be smaller than the second, not {low:g}, {high:g}")
         bounds[names.index(name)] = torch.tensor([low, high], dtype=torch.float64)

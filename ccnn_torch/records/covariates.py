@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.table import FILE, Table
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint, nearest
 from ccnn_torch.units import parse_header, si_unit_of, to_si
 
 # A cell so many times farther from the column's median than every other one leaves nothing of the others to learn.
@@ -97,9 +97,8 @@ def _check_wanted(
         raise InputError(f"covariates: '{pattern}' is a joint and an input already; remove it from the list")
     if pattern in pose:
         raise InputError(f"covariates: '{pattern}' is the measured pose, which no command can know; remove it")
-    near = nearest(pattern, free)
-    hint = f"did you mean '{near}'?" if near else f"the columns that could be are: {', '.join(free) or 'none'}"
-    raise InputError(f"covariates: {table.path} has no column '{pattern}'; {hint}")
+    near = hint(pattern, free, "the columns that could be are:")
+    raise InputError(f"covariates: {table.path} has no column '{pattern}'; {near}")
 
 
 def _matches_any(pattern: str, names: list[str]) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.table import Table
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 from ccnn_torch.units import from_si, si_unit_of, split_header, to_si
 
 Array = NDArray[np.float64]
@@ -92,9 +92,8 @@ def read_joint_map(
     names = [joint.name for joint in joints]
     for name in entries:
         if name not in names:
-            near = nearest(name, names)
-            hint = f"did you mean '{near}'?" if near else f"the joints are {', '.join(names)}"
-            raise InputError(f"joint_map: '{name}' is no joint of the mechanism; {hint}")
+            near = hint(name, names, "the joints are")
+            raise InputError(f"joint_map: '{name}' is no joint of the mechanism; {near}")
     meant = {split_header(header)[0]: split_header(target)[0] for header, target in (columns or {}).items()}
     written: dict[str, str] = {}
     factors: list[dict[str, float]] = []

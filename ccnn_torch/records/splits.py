@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint, nearest
 from ccnn_torch.units import to_si
 
 KINDS = ("random", "group", "block", "column")
@@ -300,9 +300,8 @@ def _matching(entry: str, columns: Mapping[str, Column]) -> list[str]:
 
 def _column(name: str, columns: Mapping[str, Column]) -> NDArray[np.float64]:
     if name not in columns:
-        near = nearest(name, [*columns, DEFAULT_BY])
-        hint = f"did you mean '{near}'?" if near else f"write {DEFAULT_BY} or one of: {', '.join(columns) or '(none)'}"
-        raise InputError(f"split.by: there is no column '{name}' to group by; {hint}")
+        near = hint(name, [DEFAULT_BY, *columns], "write one of")
+        raise InputError(f"split.by: there is no column '{name}' to group by; {near}")
     values = np.asarray(columns[name], dtype=np.float64)
     missing = np.flatnonzero(np.isnan(values))
     if len(missing):

@@ -193,11 +193,6 @@ class RunFolder:
         return self.path / "results.json"
 
     @property
-    def auto(self) -> Path:
-        """The choices of `methods=auto` so far."""
-        return self.path / "auto.json"
-
-    @property
     def finished(self) -> bool:
         return self.results.is_file()
 

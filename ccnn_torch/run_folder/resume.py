@@ -15,7 +15,7 @@ from ccnn_torch.training import load_checkpoint
 from ccnn_torch.version import __version__
 
 # Keys that may differ: the folder may have been moved, and where it runs and what is written last change no result.
-_FREE = ("out", "save_models", "save_report", "engine", "max_bytes")
+_FREE = ("out", "save_models", "save_report", "max_bytes")
 _MOST = 3
 
 
@@ -45,7 +45,7 @@ class FolderJob(Generic[_Config, _Data]):
         model: class of its config.
         results: the file that is written last.
         checkpoints: pattern of the files that hold the fingerprint of the config.
-        prepare: checks a config before a folder is made; gives it as it is run, and its data.
+        prepare: checks a config before a folder is made; gives its data.
         compute: fills a folder from config and data; then `quiet` and `details`, whether tables are shown
             as well; None: no result at all.
     """
@@ -54,7 +54,7 @@ class FolderJob(Generic[_Config, _Data]):
     model: type[_Config]
     results: str
     checkpoints: str
-    prepare: Callable[[_Config], tuple[_Config, _Data]]
+    prepare: Callable[[_Config], _Data]
     compute: Callable[[_Config, _Data, RunFolder, bool, bool | None], None]
 
     def start(self, config: _Config, quiet: bool = False, details: bool | None = False) -> RunFolder:
@@ -64,7 +64,7 @@ class FolderJob(Generic[_Config, _Data]):
             InputError: the config or its data cannot be used, or the folder is taken or in use.
             WriteError: a file cannot be written; what was computed until then is kept.
         """
-        config, data = self.prepare(config)
+        data = self.prepare(config)
         with RunFolder.fresh(config.out, config.name, f"{self.command} --resume") as folder:
             folder.write("config.yaml", config.to_yaml(folder.path))
             try:
@@ -91,7 +91,7 @@ class FolderJob(Generic[_Config, _Data]):
         with RunFolder.existing(path, self.command) as folder:
             config = self.model.from_file(folder.config)
             check_fingerprint(sorted(path.glob(self.checkpoints)), fingerprint(config), folder.config)
-            self.compute(*self.prepare(config), folder, quiet, details)
+            self.compute(config, self.prepare(config), folder, quiet, details)
         return folder
 
     def finish(self, config: _Config, quiet: bool = False, details: bool | None = False) -> RunFolder:

@@ -19,7 +19,7 @@ from sklearn.utils import check_array, check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 from torch import Tensor, nn
 
-from ccnn_torch.calibration.uncertainty import sd_scale
+from ccnn_torch.calibration.statistics import sd_scale
 from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
@@ -273,7 +273,6 @@ class CCNNRegressor(SteppedRegressor):
         population: individuals of each subpopulation, one a layer.
         generations: steps.
         members: independent coevolutions, whose networks are averaged.
-        refine_every: generations between refinements; 0 = only after the last.
         refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
         waves: slots for periodic nodes, found in what a refined network leaves; 0 = none, as in the paper.
         wave_searches: how often to look for them.
@@ -308,7 +307,6 @@ class CCNNRegressor(SteppedRegressor):
     population: int = 40
     generations: int = 10
     members: int = 2
-    refine_every: int = 0
     refinement_iterations: int = 20
     waves: int = CCNNSettings.waves
     wave_searches: int = CCNNSettings.wave_searches
@@ -418,7 +416,6 @@ class GRNNRegressor(LearnerRegressor):
     Args:
         iterations: steps of the search at most; it ends earlier once its moves are small.
         candidates: bandwidth vectors judged in one step.
-        narrowest, widest: range of bandwidths that the first step searches; inputs are scaled to -1 .. 1.
         queries: rows that leave-one-out judges, drawn where there are more.
         references: rows that they are predicted from, drawn where there are more.
         periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine.
@@ -439,7 +436,5 @@ class GRNNRegressor(LearnerRegressor):
 
     iterations: int = GRNNSettings.iterations
     candidates: int = GRNNSettings.candidates
-    narrowest: float = GRNNSettings.narrowest
-    widest: float = GRNNSettings.widest
     queries: int = GRNNSettings.queries
     references: int = GRNNSettings.references

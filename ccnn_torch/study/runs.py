@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from ccnn_torch.calibration.calibrate import makers
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.job import finish_runs
+from ccnn_torch.calibration.job import RUN
+from ccnn_torch.calibration.page import errors_line
+from ccnn_torch.engine import Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.report.results.run import RunResults
+from ccnn_torch.report.screen import note
 from ccnn_torch.run_folder.folder import RunFolder, locked, resume_hint
 
 _Written = TypeVar("_Written")
@@ -53,7 +58,13 @@ def run_study(study: Study, write: Write[_Written], quiet: bool = False) -> _Wri
     with locked(study.out):
         # The runs have locks of their own.
         sweep(study.out, below=False)
-        failed = finish_runs(study.runs, study.engine, quiet)
+        # Of several processes only one may draw bars. On a cluster paths that start here mean nothing.
+        alone, jobs = quiet or study.engine != "local", []
+        for name, config in study.runs.items():
+            folder = RunFolder(Path(os.path.abspath(str(config.out))))
+            call = partial(_finish, config.model_copy(update={"out": str(folder.path)}), alone)
+            jobs.append(Job(name, folder.results, call))
+        failed = run_jobs(jobs, study.engine, partial(note, quiet=quiet))
         for name, problem in failed.items():
             if problem.input:
                 raise InputError(f"case '{name}': {problem.text}")
@@ -66,6 +77,11 @@ def run_study(study: Study, write: Write[_Written], quiet: bool = False) -> _Wri
         }
         with resume_hint("the same command"):
             return write(study, results, {name: problem.text for name, problem in failed.items()})
+
+
+def _finish(config: RunConfig, quiet: bool) -> str:
+    """Start or resume a run without its tables; returns a line about the errors of its methods."""
+    return errors_line(RunResults.read(RUN.finish(config, quiet, details=None).results))
 
 
 def _check_folder(config: RunConfig) -> None:

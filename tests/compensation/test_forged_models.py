@@ -341,7 +341,7 @@ def test_a_master_of_weights_that_overflow_falls_back_in_calls_and_in_the_hook(c
     model, tripod = load_model(path), load_mechanism("tripod")
     with pytest.warns(FallbackWarning):
         assert_safe(model(JOINTS), JOINTS)
-    handle = tripod.inverse_kinematics.register_forward_hook(model.hook_for(tripod), with_kwargs=True)
+    handle = tripod.inverse_kinematics.register_forward_hook(model.compensator.hook(), with_kwargs=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         hooked = tripod.inverse_kinematics(tripod.home_pose)

@@ -29,8 +29,8 @@ from stand_ins import fields
 from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, Solution, load_model, save_model
+from ccnn_torch.compensation.fit import all_over, machine_alone
 from ccnn_torch.compensation.machine import SETTLED, InverseMachine, Machine, limits_of
-from ccnn_torch.compensation.parts import all_over, machine_alone
 from ccnn_torch.compensation.targets.from_model import form_of
 from ccnn_torch.compensation.targets.golden import probe_points, run_form
 from ccnn_torch.mechanisms import SerialArm, load_mechanism

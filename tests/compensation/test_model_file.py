@@ -38,7 +38,6 @@ from ccnn_torch.compensation.targets.golden import probe_points
 from ccnn_torch.compensation.targets.onnx_export import export_onnx, verify
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
-from ccnn_torch.mechanisms import Tripod, load_mechanism
 from ccnn_torch.training import Scaling
 
 FORMS = ("safetensors", "onnx")
@@ -360,21 +359,6 @@ def test_other_endings_are_refused(copied: Path) -> None:
     (copied / "model.bin").write_bytes((copied / "model.onnx").read_bytes())
     with pytest.raises(ModelFileError, match=r"ends in \.safetensors or \.onnx"):
         load_model(copied / "model.bin")
-
-
-def test_wrong_mechanism(folder: Path) -> None:
-    loaded = load_model(folder / "model.safetensors")
-    tripod = load_mechanism("tripod")
-    loaded.require_mechanism(tripod)
-    handle = tripod.inverse_kinematics.register_forward_hook(loaded.hook_for(tripod), with_kwargs=True)
-    assert not torch.equal(tripod.inverse_kinematics(tripod.home_pose), tripod.home_joints)
-    handle.remove()
-    with pytest.raises(ModelFileError, match="made for the mechanism tripod, not for machine_tool"):
-        loaded.require_mechanism(load_mechanism("machine_tool"))
-    with pytest.raises(ModelFileError, match=r"tripod with L = 1, not 1\.1"):
-        loaded.hook_for(Tripod(L=1.1))
-    with pytest.raises(ModelFileError, match=r"needs the master file"):
-        load_model(folder / "model.onnx").hook_for(tripod)
 
 
 def test_wrong_shapes_and_missing_covariates(folder: Path) -> None:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from stand_ins import fields, tripod_compensator
 
 from ccnn_torch.compensation import save_model
-from ccnn_torch.compensation.parts import all_over, machine_alone
+from ccnn_torch.compensation.fit import all_over, machine_alone
 from ccnn_torch.compensation.programs.gcode import GCode
 from ccnn_torch.compensation.programs.literals import Krl, Rapid
 from ccnn_torch.errors import InputError

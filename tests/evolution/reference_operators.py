@@ -6,8 +6,29 @@ Strings carry a bias as one more bit at the end of each row that is always 1.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.evolution import Genome
+from ccnn_torch.evolution.genome import active
 
 Strings = tuple[str, list[float]]
+
+
+def encode(mask: Tensor, weight: Tensor) -> Strings:
+    """Rows of bits separated by blanks (eqs. 8-10: ``"11 10 11"``), and the weights of the ones."""
+    bits = " ".join("".join("1" if bit else "0" for bit in row) for row in mask.tolist())
+    return bits, weight[active(Genome(mask, weight))].tolist()
+
+
+def decode(bits: str, weights: Sequence[float], bias: bool = False) -> Genome:
+    """Inverse of `encode`."""
+    mask = torch.tensor([[bit == "1" for bit in row] for row in bits.split()])
+    weight = torch.zeros(len(mask), mask.shape[1] + bias, dtype=torch.float64)
+    weight[active(Genome(mask, weight))] = torch.tensor(list(weights), dtype=torch.float64)
+    return Genome(mask, weight)
 
 
 def crossover(first: Strings, second: Strings, cuts: list[int]) -> tuple[Strings, Strings]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution import Coevolution, forward
-from ccnn_torch.evolution.coevolution import EPSILON, fitness, joined_errors
+from ccnn_torch.evolution.coevolution import fitness
 from ccnn_torch.evolution.genome import active
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import TrainingData
@@ -148,27 +148,12 @@ def test_mutation_off_and_no_crossover_keeps_the_gene_pool() -> None:
         assert bool((population.mask.any(1) <= start).all())
 
 
-def test_reaching_the_target_error_ends_the_training() -> None:
-    history = train(CCNN(replace(SMALL, target_error=1.1, generations=50)), toy_data([1, 2]))
-    assert len(history) < 50
-    assert bool((1 / history[-1]["fitness_best"] - EPSILON <= 1.1).all())
-    assert bool((1 / history[-2]["fitness_best"] - EPSILON > 1.1).any())
-
-
-def test_refinement_is_written_back_and_makes_the_model() -> None:
+def test_refinement_makes_the_model() -> None:
     data = toy_data([1, 2])
-    plain, refined = (
-        CCNN(SMALL),
-        CCNN(replace(SMALL, refinement_iterations=20, refine_every=4, rival_hidden=(), waves=0)),
-    )
+    plain, refined = CCNN(SMALL), CCNN(replace(SMALL, refinement_iterations=20, rival_hidden=(), waves=0))
     history, better = train(plain, data), train(refined, data)
     assert torch.equal(history[2]["error_train"], better[2]["error_train"])
     assert bool((better[-1]["error_train"] < 0.5 * history[-1]["error_train"]).all())
-    # Fitter than evolution alone at the generation it was written back, so the elite has taken it.
-    assert bool((better[3]["fitness_best"] > history[3]["fitness_best"]).all())
-    state = evolved(refined)
-    scores = joined_errors(0, state.best[0], state.best, refined._structures[0].rows.task)[:, 0, 0]
-    assert torch.allclose(fitness(scores), state.best_fitness, rtol=1e-12, atol=0)
 
 
 def test_refinement_judges_errors_in_the_channels_of_the_metric() -> None:
@@ -214,20 +199,18 @@ def test_the_network_is_pruned_and_equal() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "sentence"),
+    ("key", "value"),
     [
-        ("hidden", (6, 0), "hidden=.6, 0.: every hidden layer needs at least one node"),
-        ("generations", 0, "generations=0 must be at least 1"),
-        ("elites", 0, "elites=0 must be at least 1"),
-        ("population", 3, "population=3 must be at least elites . 2 = 4"),
-        ("crossover", 1.5, "crossover=1.5 is a probability"),
-        ("density", -0.1, "density=-0.1 is a probability"),
-        ("weight_range", 0.0, "weight_range=0.0 must be above 0"),
-        ("target_error", -1.0, "target_error=-1.0 must not be negative"),
+        ("hidden", (6, 0)),
+        ("generations", 0),
+        ("population", 3),
+        ("crossover", 1.5),
+        ("density", -0.1),
+        ("weight_range", 0.0),
     ],
 )
-def test_settings_out_of_range_are_refused(key: str, value: object, sentence: str) -> None:
-    with pytest.raises(ValueError, match=sentence):
+def test_settings_out_of_range_are_refused(key: str, value: object) -> None:
+    with pytest.raises(ValueError, match=key):
         CCNNSettings(**{key: value})  # type: ignore[arg-type]
 
 

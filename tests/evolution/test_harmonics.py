@@ -49,7 +49,7 @@ def test_finds_the_harmonics_that_are_there_and_no_others() -> None:
     assert float(found.amplitude[:, 1].abs().max()) < 0.02
     fresh = uniform_rows(2, ROWS, 5)[..., :2]
     truth = gears(fresh * step.unsqueeze(-2))
-    error = found.deviation(fresh) - truth
+    error = found(fresh) - truth
     assert float(error.square().mean().sqrt()) < 0.05
     # What is claimed to be known of the amplitudes is what is known.
     assert 0.5 < float((error[..., 0].square() / found.variance(fresh)[..., 0]).mean()) < 2
@@ -61,14 +61,14 @@ def test_lines_seen_in_part_of_a_turn_hold_in_the_rest() -> None:
     found = fit_harmonics(inputs, step, targets, weights(), (0, 1), None, 40)
     far = torch.zeros(2, 50, 2, dtype=torch.float64)
     far[..., 0] = torch.linspace(-0.6, -0.3, 50, dtype=torch.float64)
-    error = (found.deviation(far) - gears(far * step.unsqueeze(-2)))[..., 0]
+    error = (found(far) - gears(far * step.unsqueeze(-2)))[..., 0]
     assert float(error.square().mean().sqrt()) < 0.1
 
 
 def test_noise_alone_gives_next_to_nothing() -> None:
     inputs, step, _ = rows()
     found = fit_harmonics(inputs, step, noise_like(inputs, 3), weights(), (0, 1), None, 40)
-    assert float(found.deviation(inputs).square().mean()) < 0.05
+    assert float(found(inputs).square().mean()) < 0.05
 
 
 def test_errors_are_judged_in_the_channels_of_the_metric() -> None:

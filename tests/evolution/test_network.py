@@ -8,9 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 from module_graph import to_onnx
+from reference_operators import decode
 from torch import Tensor
 
-from ccnn_torch.evolution import Genome, MaskedNetwork, alive_nodes, decode, forward, prune
+from ccnn_torch.evolution import Genome, MaskedNetwork, alive_nodes, forward, prune
 from ccnn_torch.evolution.network import average, fed_nodes
 
 SIZES = st.sampled_from([[3, 6, 6, 3], [2, 4, 1], [3, 3], [4, 2, 3, 2, 2]])

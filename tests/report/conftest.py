@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from report_runs import fill, tripod_run
 
-from ccnn_torch.calibration.figures import write_report
+from ccnn_torch.calibration.job import write_report
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.results.run import RunResults
 
@@ -37,5 +37,5 @@ def run_folder(tmp_path: Path) -> Path:
 def report_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with its report, to be read only."""
     folder = fill(tmp_path_factory.mktemp("run"))
-    write_report(folder)
+    write_report(folder, RunResults.read(folder / "results.json"))
     return folder

@@ -7,10 +7,10 @@ from pathlib import Path
 import torch
 
 from ccnn_torch.compensation.compensator import Compensator
+from ccnn_torch.compensation.fit import ROWS, all_over, machine_alone
 from ccnn_torch.compensation.model_files.load import MACHINE_FORMS, LoadedModel, load_compensation, read_model
 from ccnn_torch.compensation.model_files.metadata import card_of, from_json
 from ccnn_torch.compensation.model_files.signature import check_signature, sign_content, signature_path
-from ccnn_torch.compensation.parts import ROWS, all_over, machine_alone
 from ccnn_torch.effects import default_gravity
 from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.found_machine import FoundMachine, machine_of_block

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ccnn_torch.compensation.compensator import WAYS, Compensator, Hook
+from ccnn_torch.compensation.compensator import WAYS, Compensator
 from ccnn_torch.compensation.machine import FARTHEST
 from ccnn_torch.compensation.model_files.metadata import (
     RUN_ERRORS,
@@ -336,7 +335,7 @@ class LoadedModel:
             return np.array([[edge["low"], edge["high"]] for edge in edges])
         measured = self.machine.joints
         if not len(measured):
-            from ccnn_torch.compensation.parts import all_over
+            from ccnn_torch.compensation.fit import all_over
 
             joints = all_over(self.machine.nominal).joints
             fine = joints[torch.isfinite(joints).all(-1)]
@@ -362,42 +361,6 @@ class LoadedModel:
         """
         with code_refused(f"{self.path}: its mechanism", allow_code):
             return mechanism_from_description(self.facts["mechanism"], allow_code=True)
-
-    def require_mechanism(self, mechanism: Mechanism) -> None:
-        """Refuse a mechanism that the model was not made for.
-
-        Raises:
-            ModelFileError: name, joints, pose coordinates or a parameter differ.
-        """
-        made_for, given = {"name": "", "joints": [], "pose": []} | self.facts["mechanism"], mechanism.describe()
-        for key, what in (("name", "mechanism"), ("joints", "joints"), ("pose", "pose coordinates")):
-            if made_for[key] != given[key]:
-                raise ModelFileError(
-                    f"{self.path}: this model was made for the {what} {_words(made_for[key])}, "
-                    f"not for {_words(given[key])}; take the model of that machine"
-                )
-        ours, theirs = made_for.get("parameters", {}), given.get("parameters", {})
-        wrong = [
-            k for k in ours if k not in theirs or not math.isclose(ours[k], theirs[k], rel_tol=1e-9, abs_tol=1e-12)
-        ]
-        if wrong:
-            raise ModelFileError(
-                f"{self.path}: this model was made for {mechanism.name} with {wrong[0]} = {ours[wrong[0]]:g}, not "
-                f"{theirs.get(wrong[0])}; build the mechanism from the model: "
-                "model.mechanism()"
-            )
-
-    def hook_for(self, mechanism: Mechanism) -> Hook:
-        """The compensator's hook, for this mechanism's inverse kinematics.
-
-        Raises:
-            ModelFileError: the model was made for another mechanism, or the file is an export, which torch cannot
-                differentiate.
-        """
-        self.require_mechanism(mechanism)
-        if self.compensator is None:
-            raise ModelFileError(f"{self.path}: a torch hook needs the master file; load the .safetensors beside it")
-        return self.compensator.hook()
 
 
 def read_model(path: Path) -> bytes:
@@ -490,7 +453,3 @@ def load_compensation(
 
         load = load_geometry
     return load(path, public_key=public_key, allow_code=allow_code)
-
-
-def _words(value: str | list[str]) -> str:
-    return value if isinstance(value, str) else ", ".join(value)

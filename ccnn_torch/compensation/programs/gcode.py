@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from ccnn_torch.compensation.programs.text import LEAST, NUMBER, Array, Edit, Point, edited, masked, number_like
+from ccnn_torch.compensation.programs.literals import LEAST, NUMBER, Array, Edit, Point, edited, masked, number_like
 from ccnn_torch.errors import InputError
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, nearest_euler
 

@@ -14,8 +14,7 @@ from ccnn_torch.compensation.job import ROWS, frames_of, nearest_measured
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.programs import G_CODE
 from ccnn_torch.compensation.programs.gcode import GCode
-from ccnn_torch.compensation.programs.literals import Krl, Rapid
-from ccnn_torch.compensation.programs.text import Array, Point
+from ccnn_torch.compensation.programs.literals import Array, Krl, Point, Rapid
 from ccnn_torch.compensation.routines import DAMPED
 from ccnn_torch.display import plain
 from ccnn_torch.errors import FallbackWarning, InputError

@@ -155,11 +155,6 @@ def _routine(routine: Routine, form: Form, dialect: Dialect, static: str) -> str
     return "\n".join([head, "{", *(f"    {line}" for line in lines), "    return (int)status[0];", "}"])
 
 
-def _suffix(form: Form) -> str:
-    """Of C's functions: fabsf is that of single precision."""
-    return "f" if form.dtype == "float32" else ""
-
-
 def _selftest(form: Form, golden: Golden) -> str:
     dialect, outputs = c_dialect(form.dtype), golden.outputs
     names = {"joints": golden.joints, "covariates": golden.covariates} | {
@@ -181,7 +176,8 @@ def _selftest(form: Form, golden: Golden) -> str:
         zero=dialect.literal(0.0),
         one=dialect.literal(1.0),
         damped=dialect.literal(DAMPED_TOLERANCE),
-        s=_suffix(form),
+        # Of C's functions: fabsf is that of single precision.
+        s="f" if form.dtype == "float32" else "",
     )
 
 

@@ -18,15 +18,22 @@ from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
 from ccnn_torch.compensation.targets.lowered import Found, Stack, with_readme
 from ccnn_torch.compensation.targets.machines import print_hal, print_klipper
 from ccnn_torch.compensation.targets.onnx_export import export_onnx
-from ccnn_torch.compensation.targets.robots import print_lerobot, print_pal, print_robot, print_ur
-from ccnn_torch.compensation.targets.ros2_control import middle_of, offsets_alone, print_ros2_control
+from ccnn_torch.compensation.targets.robots import (
+    middle_of,
+    offsets_alone,
+    print_lerobot,
+    print_pal,
+    print_robot,
+    print_ros2_control,
+    print_ur,
+)
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.display import plain
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 from ccnn_torch.version import __version__
 
 DTYPES = ("float64", "float32")
@@ -174,9 +181,7 @@ def export_model(
     """
     for value, known, what in ((to, [*TARGETS], "target"), (dtype, DTYPES, "dtype")):
         if value not in known:
-            near = nearest(value, known)
-            hint = f" (did you mean '{near}'?)" if near else ""
-            raise InputError(f"there is no {what} '{value}'{hint}; there are {', '.join(known)}")
+            raise InputError(f"there is no {what} '{value}'; {hint(value, known)}")
     if current is not None and to not in CURRENT:
         raise InputError(f"--current: is read by the targets {', '.join(CURRENT)}, not by {to}; leave it out")
     model = load_compensation(path, public_key=public_key, allow_code=allow_code)

@@ -27,7 +27,7 @@ _PRODUCTS_THIN, _THIN = 4096, 0.5
 _OF_TRUTHS = {"add": "or", "mul": "and", "max": "or", "min": "and"}
 # What only moves elements: torch does it on their numbers.
 _MOVES = frozenset({
-    "reshape", "permute", "t", "transpose", "expand", "slice", "select", "unsqueeze", "squeeze",
+    "permute", "t", "transpose", "expand", "slice", "select", "unsqueeze", "squeeze",
     "flip", "cat", "stack", "index", "index_select", "split", "split_with_sizes", "unbind", "diagonal", "repeat",
     "roll", "slice_scatter", "select_scatter",
 })  # fmt: skip

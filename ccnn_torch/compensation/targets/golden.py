@@ -28,8 +28,8 @@ _BESIDE = {"float64": 1e-9, "float32": 1e-3}
 
 
 @dataclass(frozen=True)
-class Vectors:
-    """Rows of inputs and outputs.
+class Golden:
+    """Rows of inputs and outputs, of a form as `run_form` gives them.
 
     Attributes:
         joints: given, `s x n` [SI], with NaN and infinities.
@@ -37,6 +37,7 @@ class Vectors:
         outputs: of the eager model by name, among them `status` and `ideal_status`.
         tolerance: of deviation and of ideal - joints, `n` [SI].
         relative: of the standard deviation [1].
+        hard: why single precision may not hold the model.
     """
 
     joints: Array
@@ -44,6 +45,7 @@ class Vectors:
     outputs: dict[str, Array]
     tolerance: Array
     relative: float
+    hard: str = ""
 
     def errors(self, found: dict[str, Array], names: Collection[str] = ()) -> dict[str, float]:
         """Largest difference of each output in the first rows, in units of what is allowed: above 1 is wrong.
@@ -178,17 +180,6 @@ def run_routine(form: Form, name: str, joints: Array, covariates: Array) -> dict
 
     execute(routine.statements, values, call, zeros)
     return {key: values[key] for key in routine.returns} | {"status": values["status"][:, 0].astype(int)}
-
-
-@dataclass(frozen=True)
-class Golden(Vectors):
-    """Those of a form, with outputs as `run_form` gives them.
-
-    Attributes:
-        hard: why single precision may not hold the model.
-    """
-
-    hard: str
 
 
 def golden_vectors(compensator: Compensator, form: Form) -> Golden:

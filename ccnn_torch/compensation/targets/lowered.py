@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ccnn_torch.compensation.fit import ROWS, all_over
 from ccnn_torch.compensation.model_files.load import LoadedModel
-from ccnn_torch.compensation.parts import ROWS, all_over
 from ccnn_torch.display import number_text, plain
 from ccnn_torch.effects import Situation, measured_pose, reached
 from ccnn_torch.errors import MethodFailedError

@@ -23,11 +23,11 @@ _ELEMENTWISE = {
     "add": "add", "sub": "sub", "mul": "mul", "div": "div", "neg": "neg", "abs": "abs", "exp": "exp", "log": "log",
     "sin": "sin", "cos": "cos", "tan": "tan", "tanh": "tanh", "asin": "asin", "acos": "acos", "atan": "atan",
     "atan2": "atan2", "sqrt": "sqrt", "floor": "floor", "minimum": "min", "maximum": "max", "lt": "lt", "le": "le",
-    "eq": "eq", "where": "select", "logical_and": "and", "bitwise_and": "and", "__and__": "and", "logical_or": "or",
-    "bitwise_or": "or", "__or__": "or", "logical_not": "not", "bitwise_not": "not",
+    "eq": "eq", "where": "select", "logical_and": "and", "bitwise_and": "and", "logical_or": "or",
+    "bitwise_or": "or", "logical_not": "not", "bitwise_not": "not",
 }  # fmt: skip
 _REDUCTIONS = {"sum": "add", "amax": "max", "amin": "min", "any": "or", "all": "and"}
-_SAME = frozenset({"lift_fresh_copy", "lift_fresh", "detach", "detach_", "alias", "clone", "contiguous", "copy"})
+_SAME = frozenset({"lift_fresh_copy", "lift_fresh", "detach", "alias", "clone", "copy"})
 _FILLS = {"zeros_like": 0.0, "new_zeros": 0.0, "empty_like": 0.0, "ones_like": 1.0, "new_ones": 1.0}
 _PRODUCTS = frozenset({"mm", "bmm", "matmul", "mv"})
 # Of no consequence where all numbers are of one type.
@@ -169,10 +169,6 @@ class Lowering(ABC):
         """Truth values as numbers."""
         return self.each("select", value, 1.0, 0.0) if self.is_truth(value) else value
 
-    def _linear(self, value: Any, weight: Any, bias: Any = None) -> Any:
-        found = self.product(value, weight.mT)
-        return found if bias is None else self.each("add", found, bias)
-
 
 def operation_of(node: Node) -> str:
     """Of a node, without overload; "" where it is none."""
@@ -185,12 +181,12 @@ def _dims(value: Any, dim: Any) -> list[int]:
 
 
 _COMPOSED: dict[str, Callable[..., Any]] = {
-    "linear": Lowering._linear, "addmm": lambda own, bias, a, b: own.each("add", own.product(a, b), bias),
+    "addmm": lambda own, bias, a, b: own.each("add", own.product(a, b), bias),
     "relu": lambda own, v: own.each("max", v, 0.0),
     "sigmoid": lambda own, v: own.each("div", 1.0, own.each("add", 1.0, own.each("exp", own.each("neg", v)))),
     "reciprocal": lambda own, v: own.each("div", 1.0, v),
     "rsqrt": lambda own, v: own.each("div", 1.0, own.each("sqrt", v)),
-    "rsub": lambda own, a, b: own.each("sub", b, a), "square": lambda own, v: own.each("mul", v, v),
+    "rsub": lambda own, a, b: own.each("sub", b, a),
     "hypot": lambda own, a, b: own.each("sqrt", own.each("add", own.each("mul", a, a), own.each("mul", b, b))),
     "clamp": lambda own, *args, **named: own.clamped(*args, **named),
     "clamp_min": lambda own, v, least: own.clamped(v, least),
@@ -202,7 +198,7 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "isnan": lambda own, v: own.each("not", own.each("eq", v, v)),
     "isinf": lambda own, v: own.each("eq", own.each("abs", v), math.inf),
     "isfinite": lambda own, v: own.each("lt", own.each("abs", v), math.inf),
-    "to": Lowering._cast, "_to_copy": Lowering._cast,
+    "_to_copy": Lowering._cast,
 }  # fmt: skip
 
 

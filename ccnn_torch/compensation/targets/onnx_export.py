@@ -32,7 +32,7 @@ from ccnn_torch.compensation.routines import (
     routines_of,
     status_of,
 )
-from ccnn_torch.compensation.targets.golden import Vectors, probe_points
+from ccnn_torch.compensation.targets.golden import Golden, probe_points
 from ccnn_torch.compensation.targets.lowering import recorded
 from ccnn_torch.compensation.targets.onnx_graph import Graph, Value
 from ccnn_torch.compensation.targets.onnx_operations import ByTensors
@@ -228,7 +228,7 @@ def verify(compensator: Compensator, run: Any, form: str, outputs: Sequence[str]
     given = joints.numpy(), None if covariates is None else covariates.numpy()
     share = min(compensator.export_tolerance, _LOOSEST)
     wanted = {name: value.numpy() for name, value in expected.items()}
-    vectors = Vectors(given[0], joints.numpy()[:, :0], wanted, share * compensator.most.numpy(), share)
+    vectors = Golden(given[0], joints.numpy()[:, :0], wanted, share * compensator.most.numpy(), share)
     for rows in (len(joints), 1):
         found = run(*(None if v is None else v[:rows] for v in given))
         wrong = [name for name, error in vectors.errors(found, outputs).items() if not error <= 1]

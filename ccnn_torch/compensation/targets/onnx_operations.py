@@ -29,8 +29,7 @@ class ByTensors(Lowering):
     """Into a graph."""
 
     native: ClassVar[Mapping[str, str]] = {
-        "sigmoid": "sigmoid", "relu": "Relu", "reciprocal": "Reciprocal", "sign": "Sign", "softplus": "Softplus",
-        "elu": "Elu", "erf": "Erf",
+        "sigmoid": "sigmoid", "relu": "Relu", "reciprocal": "Reciprocal", "sign": "Sign",
     }  # fmt: skip
 
     def __init__(self, graph: Graph) -> None:
@@ -184,14 +183,6 @@ class ByTensors(Lowering):
         sizes = self.graph.constant(np.array(batch_of(shape, self.graph.rows), np.int64))
         return self.graph.node("Reshape", [solid.name, sizes], shape, shape)
 
-    def _flattened(self, value: Value, start: int = 0, end: int = -1) -> Value:
-        rank = len(value.shape)
-        return self._reshaped(value, [*value.shape[: start % rank], -1, *value.shape[end % rank + 1 :]])
-
-    def _unflattened(self, value: Value, dim: int, sizes: Sequence[int]) -> Value:
-        dim %= len(value.shape)
-        return self._reshaped(value, [*value.shape[:dim], *sizes, *value.shape[dim + 1 :]])
-
     def _unsqueezed(self, value: Value, dim: int) -> Value:
         solid = self.graph.solid(value)
         at = dim % (len(solid.shape) + 1)
@@ -258,9 +249,7 @@ class ByTensors(Lowering):
             [self._unsqueezed(p, dim) if isinstance(p, Value) else p.unsqueeze(dim) for p in parts], dim
         )
 
-    def _expanded(self, value: Any, shape: Sequence[int]) -> Any:
-        if isinstance(value, Tensor):
-            return value.expand(*shape)
+    def _expanded(self, value: Value, shape: Sequence[int]) -> Value:
         solid = self.graph.solid(value)
         more = len(shape) - len(solid.shape)
         wanted = tuple(solid.shape[k - more] if n == -1 else n for k, n in enumerate(shape))
@@ -268,10 +257,6 @@ class ByTensors(Lowering):
             # So that names and shapes agree in rank.
             solid = self._unsqueezed(solid, 0)
         return Value(wanted, solid.name, solid.real)
-
-    def _broadcast(self, tensors: Sequence[Any]) -> list[Any]:
-        shape = np.broadcast_shapes(*(v.shape for v in tensors))
-        return [self._expanded(v, shape) for v in tensors]
 
     def _split(self, value: Value, sizes: Any, dim: int = 0) -> list[Any]:
         length = value.shape[dim]
@@ -292,13 +277,11 @@ def _alike(value: Any) -> float | None:
 
 
 _MOVES: dict[str, Callable[..., Any]] = {
-    "reshape": ByTensors._reshaped, "view": ByTensors._reshaped, "_unsafe_view": ByTensors._reshaped,
-    "flatten": ByTensors._flattened, "unflatten": ByTensors._unflattened, "unsqueeze": ByTensors._unsqueezed,
+    "view": ByTensors._reshaped, "_unsafe_view": ByTensors._reshaped, "unsqueeze": ByTensors._unsqueezed,
     "squeeze": ByTensors._squeezed, "permute": ByTensors._permuted, "transpose": ByTensors._transposed,
-    "mT": ByTensors._transposed, "t": ByTensors._transposed, "select": ByTensors._selected,
+    "t": ByTensors._transposed, "select": ByTensors._selected,
     "slice": ByTensors._sliced, "index": ByTensors._indexed,
     "index_select": lambda own, v, dim, places: own.picked(v, dim % len(v.shape), places),
     "flip": ByTensors._flipped, "cat": ByTensors._joined, "stack": ByTensors._stacked, "expand": ByTensors._expanded,
-    "expand_as": lambda own, a, b: own._expanded(a, b.shape), "broadcast_tensors": ByTensors._broadcast,
     "split": ByTensors._split, "split_with_sizes": ByTensors._split, "unbind": ByTensors._unbound,
 }  # fmt: skip

@@ -11,7 +11,7 @@ from ccnn_torch.identification.problems.problem import Solver
 from ccnn_torch.identification.solvers.hga import HybridGenetic
 from ccnn_torch.identification.solvers.lm import solve_lm
 from ccnn_torch.identification.solvers.tikhonov import solve_tikhonov
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint, nearest
 
 SOLVERS: dict[str, Any] = {"lm": solve_lm, "hga": HybridGenetic, "tikhonov": solve_tikhonov}
 """Name -> solver, or the class that makes it of its settings; Levenberg-Marquardt (`lm`) is the one to use."""
@@ -36,9 +36,7 @@ def get_solver(name: str, **settings: Any) -> Solver:
     known = [key for key in inspect.signature(maker).parameters if key not in _CALL]
     for key in settings:
         if key not in known:
-            near = nearest(key, known, 0.6)
-            hint = f"did you mean '{near}'?" if near else f"it takes {', '.join(known) or 'none'}"
-            raise InputError(f"solver '{name}' has no setting '{key}'; {hint}")
+            raise InputError(f"solver '{name}' has no setting '{key}'; {hint(key, known, 'it takes')}")
     made: Any = maker(**settings) if inspect.isclass(maker) else functools.partial(maker, **settings)
     solver: Solver = made
     return solver

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.table import Table
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 
 Keys = Mapping[str, Any]
 """What is said of a form beside its path, by key."""
@@ -108,10 +108,9 @@ def read_form(path: str | Path, keys: Keys) -> Table | None:
     for key in keys:
         known = form.keys if form else ()
         if key not in known:
-            near = nearest(key, known)
-            hint = f"did you mean '{near}'?" if near else f"there are {', '.join(known)}" if known else "leave it out"
+            near = hint(key, known) if known else "leave it out"
             raise InputError(
-                f"motion_keys: '{key}' says nothing of {path}, {form.about if form else 'a table'}; {hint}"
+                f"motion_keys: '{key}' says nothing of {path}, {form.about if form else 'a table'}; {near}"
             )
     if form is None:
         return None

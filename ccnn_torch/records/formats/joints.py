@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.table import Table
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 
 Array = NDArray[np.float64]
 # They hold things, which is no free motion, and have units of their own.
@@ -79,9 +79,7 @@ def chosen_joints(
 def _refuse_unknown(names: Sequence[str], known: Sequence[str], key: str, path: Path) -> None:
     for name in names:
         if name not in known:
-            near = nearest(name, known)
-            hint = f"did you mean '{near}'?" if near else f"there are {', '.join(known)}"
-            raise InputError(f"motion_keys: {key}: {path} has no joint '{visible(name)}'; {hint}")
+            raise InputError(f"motion_keys: {key}: {path} has no joint '{visible(name)}'; {hint(name, known)}")
 
 
 def motion_table(
