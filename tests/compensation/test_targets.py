@@ -66,7 +66,7 @@ def made_kind(kind: str, dtype: str = "float64", sd: bool = True) -> tuple[Compe
     return compensator, *made(compensator, dtype, sd)
 
 
-# "tripod with effects", the longest, is an example of tests/fuzz/test_fuzz_targets.py.
+# "tripod with effects", the longest, has what the sliding arm and the five-bar with effects have.
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "tripod with effects"])
 def test_every_kind_of_model_gives_its_numbers_in_c(kind: str, tmp_path: Path) -> None:
     _, form, golden = made_kind(kind)
