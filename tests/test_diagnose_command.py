@@ -113,14 +113,17 @@ def test_rows_set_aside_are_called_by_one_name_everywhere(cli: Cli, tmp_path: Pa
     moved = ", ".join(str(int(line) + 1) for line in lines.split(","))
     name = f"lines {moved} (rows {rows})"
     sentence = f"Far from what any fit to the other rows says: 3, at {name}."
-    code, shown, _ = cli("check", "--records", path, "--mechanism", "five_bar", "--out", tmp_path)
+    few = "effects=[geometry,joint_offset]"
+    code, shown, _ = cli("check", "--records", path, "--mechanism", "five_bar", "--out", tmp_path, few)
     assert code == 0 and sentence in " ".join(shown.split())
     looked = json.loads((tmp_path / "check.json").read_text(encoding="utf-8"))
     assert {int(row) for row in rows.split(",")} <= {row + 1 for row in looked["aside"]}
     assert looked["lines_aside"] == [row + 3 for row in looked["aside"]]
     assert f"{len(looked['aside'])} rows set aside. " in " ".join(shown.split())
     # Beside the check the diagnosis may be written: both say what the same rows show.
-    code, shown, _ = cli("diagnose", "--records", path, "--mechanism", "five_bar", "--out", tmp_path, "--no-network")
+    code, shown, _ = cli(
+        "diagnose", "--records", path, "--mechanism", "five_bar", "--out", tmp_path, "--no-network", few
+    )
     assert code == 0 and sentence in " ".join(shown.split())
     results = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
     assert results["rows_set_aside"] == looked["aside"] and results["why_set_aside"] == looked["why_aside"]
@@ -261,6 +264,7 @@ def test_the_command_on_the_screen_puts_the_effect_in_a_compensator(
     rows.rename(rows.parent / "my data" / "rows 1.csv")
     monkeypatch.chdir(rows.parent)
     words = ("--records", "my data/rows 1.csv", "--mechanism", "five_bar", "--noise", "1e-5", "--no-network")
+    words += ("--effects", "geometry,joint_offset,joint_gain,backlash")
     code, shown, _ = cli("diagnose", *words, "--out", "found")
     assert code == 0 and "How large is the gap?" not in shown and "--details" in shown
     assert "found/next_measurements.csv" in shown and "where nothing was measured (by block)" in shown

@@ -49,7 +49,7 @@ def test_numbers_are_told_beside_what_is_too_little_to_be_named() -> None:
     offset = {"q1": 2e-3, "q2": -2e-3, "q3": 2.5e-3}
     sag = acting(situation, "gravity", q1=2e-4, q2=2e-4, q3=3e-4)
     poses = reached_with(situation, [acting(situation, "joint_offset", **offset), sag], 2, 1e-5)
-    said = diagnose_rows(situation, poses)
+    said = diagnose_rows(situation, poses, effects=["geometry", "joint_offset", "joint_gain", "gravity"])
     assert said.verdict["effects"] == ["joint_offset"]
     told = next(e for e in said.effects if e["name"] == "joint_offset")["parameters"]
     for name, value in offset.items():
@@ -62,7 +62,7 @@ def test_what_no_name_stands_for_is_told_beside_nothing() -> None:
     change = 2e-3 * torch.exp(-(((situation.joints[:, 1] - situation.joints[:, 1].median()) / 0.15) ** 4))
     moved = (situation.jacobian[..., 1] * change[:, None])[:, :2]
     offset = reached_with(situation, [acting(situation, "joint_offset", q1=3e-5)], 2)
-    said = diagnose_rows(situation, offset + moved)
+    said = diagnose_rows(situation, offset + moved, effects=[*FEW, "joint_gain", "transmission"])
     assert said.verdict["outside_library"] and not said.verdict["effects"]
     assert not any("also holds" in note for note in said.notes)
 
