@@ -113,14 +113,17 @@ def test_rows_set_aside_are_called_by_one_name_everywhere(cli: Cli, tmp_path: Pa
     moved = ", ".join(str(int(line) + 1) for line in lines.split(","))
     name = f"lines {moved} (rows {rows})"
     sentence = f"Far from what any fit to the other rows says: 3, at {name}."
-    code, shown, _ = cli("check", "--records", path, "--mechanism", "five_bar", "--out", tmp_path)
+    few = "effects=[geometry,joint_offset]"
+    code, shown, _ = cli("check", "--records", path, "--mechanism", "five_bar", "--out", tmp_path, few)
     assert code == 0 and sentence in " ".join(shown.split())
     looked = json.loads((tmp_path / "check.json").read_text(encoding="utf-8"))
     assert {int(row) for row in rows.split(",")} <= {row + 1 for row in looked["aside"]}
     assert looked["lines_aside"] == [row + 3 for row in looked["aside"]]
     assert f"{len(looked['aside'])} rows set aside. " in " ".join(shown.split())
     # Beside the check the diagnosis may be written: both say what the same rows show.
-    code, shown, _ = cli("diagnose", "--records", path, "--mechanism", "five_bar", "--out", tmp_path, "--no-network")
+    code, shown, _ = cli(
+        "diagnose", "--records", path, "--mechanism", "five_bar", "--out", tmp_path, "--no-network", few
+    )
     assert code == 0 and sentence in " ".join(shown.split())
     results = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
     assert results["rows_set_aside"] == looked["aside"] and results["why_set_aside"] == looked["why_aside"]
@@ -261,6 +264,7 @@ def test_the_command_on_the_screen_puts_the_effect_in_a_compensator(
     rows.rename(rows.parent / "my data" / "rows 1.csv")
     monkeypatch.chdir(rows.parent)
     words = ("--records", "my data/rows 1.csv", "--mechanism", "five_bar", "--noise", "1e-5", "--no-network")
+    words += ("--effects", "geometry,joint_offset,joint_gain,backlash")
     code, shown, _ = cli("diagnose", *words, "--out", "found")
     assert code == 0 and "How large is the gap?" not in shown and "--details" in shown
     assert "found/next_measurements.csv" in shown and "where nothing was measured (by block)" in shown
@@ -343,23 +347,27 @@ def test_a_terminal_shows_the_steps_and_the_time_left(rows: Path, monkeypatch: p
     assert quiet.getvalue() == ""
 
 
-def test_nothing_slow_is_loaded_that_a_diagnosis_does_not_need(rows: Path, tmp_path: Path) -> None:
+def test_nothing_is_loaded_that_a_command_does_not_need(rows: Path, tmp_path: Path) -> None:
+    """To compensate takes neither the diagnosis nor the learners that are evolved; a diagnosis nothing slow."""
     arm = Path(__file__).parent.parent / "experiments" / "data"
     some = tmp_path / "some.csv"
     some.write_text("".join((arm / "ur10_b_500.csv").read_text().splitlines(keepends=True)[:26]))
     watched = "{'torch._dynamo', 'sympy', 'scipy', 'pint', 'torch.utils.tensorboard'}"
     program = f"""
 import sys
+import ccnn_torch.compensation.job
+loaded = [m.split(".")[1] for m in sys.modules if m.startswith("ccnn_torch.")]
+print(len(loaded) < 120, sorted({{"diagnosis", "motion", "evolution", "report"}} & set(loaded)))
 from ccnn_torch.cli.application import app
 def run(*words): app(words, standalone_mode=False)
-run("check", "--records", {str(some)!r}, "--mechanism", {str(arm / "ur10.yaml")!r}, "--quiet")
+run("check", "--records", {str(some)!r}, "--mechanism", {str(arm / "ur10.yaml")!r}, "--quiet", "effects=[geometry]")
 print("matplotlib" in sys.modules)
 of = ("--records", {str(rows)!r}, "--mechanism", "five_bar", "--effects", "backlash", "--quiet")
 run("diagnose", *of, "--out", {str(tmp_path / "found")!r})
 print(sorted({watched} & set(sys.modules)), "matplotlib" in sys.modules)
 """
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert told.splitlines() == ["False", "[] True"]
+    assert told.splitlines() == ["True []", "False", "[] True"]
 
 
 def test_a_length_is_the_noise_of_an_arm_measured_in_position(cli: Cli, tmp_path: Path) -> None:

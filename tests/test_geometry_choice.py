@@ -19,14 +19,14 @@ from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rot
 from ccnn_torch.records import write_table
 
 
-def _prepared(folder: Path, geometry_error: float, wave: float, **keys: object) -> Prepared:
+def _prepared(folder: Path, geometry_error: float, wave: float, rows: int = 120, **keys: object) -> Prepared:
     """A tripod with errors of its parameters, a wave of its joints that no parameter has, and 5 µm of noise [m]."""
     tripod = load_mechanism("tripod")
     generator = torch.Generator().manual_seed(3)
     truth = tripod.nominal + geometry_error
     low = torch.tensor([-0.15, 0.45, -0.2], dtype=torch.float64)
     high = torch.tensor([0.15, 0.65, 0.2], dtype=torch.float64)
-    wanted = low + (high - low) * torch.rand(120, 3, generator=generator, dtype=torch.float64)
+    wanted = low + (high - low) * torch.rand(rows, 3, generator=generator, dtype=torch.float64)
     joints = tripod.solve_inverse(wanted)
     pose = tripod.forward_kinematics(joints + wave * torch.sin(20 * joints.roll(1, -1)), truth, wanted)
     pose = pose + 5e-6 * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
@@ -56,7 +56,7 @@ def test_what_geometry_leaves_is_learned(tmp_path: Path) -> None:
 def test_held_out_rows_do_not_choose(tmp_path: Path) -> None:
     """The figures of the choice are the same whatever the test rows hold."""
     keys = {"effects": ["joint_gain"]}
-    first = _prepared(tmp_path, 3e-4, 1e-4, **keys)
+    first = _prepared(tmp_path, 3e-4, 1e-4, rows=60, **keys)
     lines = (tmp_path / "rows.csv").read_text().splitlines()
     for row in first.dataset.splits[0].test.tolist():
         cells = lines[row + 1].split(",")

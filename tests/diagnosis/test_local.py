@@ -60,7 +60,8 @@ def test_a_quick_sway_follows_the_time_and_is_no_noise() -> None:
     wave = torch.sin(2 * torch.pi * periods * (time - time.min()) / (time.max() - time.min()))
     way = torch.tensor([1.0 if c.unit == "m" else 0.0 for c in situation.mechanism.pose], dtype=torch.float64)
     drawn = torch.randn(situation.pose.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    diagnosis = diagnose_rows(situation, situation.pose + NOISE * (5 * wave[:, None] * way + drawn))
+    effects = ["geometry", "joint_offset", "joint_gain", "backlash", "drift"]
+    diagnosis = diagnose_rows(situation, situation.pose + NOISE * (5 * wave[:, None] * way + drawn), effects=effects)
     said = diagnosis.verdict
     assert said["outside_library"] and said["driver"] == "time" and not said["effects"]
     (note,) = [n for n in diagnosis.notes if "sway" in n]

@@ -32,7 +32,7 @@ def test_backlash_is_named_by_directions_from_the_order_of_the_rows() -> None:
     rows = rows_of("five_bar", 200, 2)
     bare = replace(rows, covariates={n: v for n, v in rows.covariates.items() if not n.startswith("direction")})
     pose = measured(replace(bare, covariates=bare.covariates | directions_of_order(bare)), {"backlash": 6.0}, 12)
-    found = diagnose_rows(bare, pose)
+    found = diagnose_rows(bare, pose, effects=["geometry", "joint_offset", "backlash", "friction"])
     assert found.verdict["effects"] == ["backlash"] and found.verdict["probability"] <= 0.9, found.verdict
     assert any("taken from the order of the rows: record direction1[1]" in text for text in found.cautions)
     # The same rows in another order show no direction.

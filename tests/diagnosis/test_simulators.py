@@ -57,7 +57,8 @@ def _measured(
 
 def _diagnosed(path: Path) -> Diagnosis:
     mechanism = load_mechanism(PRESS)
-    return diagnose(load_records(path, mechanism, learns=False), mechanism, noise=NOISE)
+    effects = ["geometry", "joint_offset", "backlash", "compliance", "parameter spring1", "parameter spring2"]
+    return diagnose(load_records(path, mechanism, learns=False), mechanism, noise=NOISE, effects=effects)
 
 
 def test_a_wrong_spring_is_found_under_load_by_its_name(tmp_path: Path) -> None:

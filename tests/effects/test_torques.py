@@ -85,7 +85,8 @@ def _measured(folder: Path, rows: int, geometry: float) -> Array:
 def test_what_each_joint_gives_for_its_measured_torque_is_told(geometry: float, tmp_path: Path) -> None:
     _measured(tmp_path, 90, geometry)
     arm = load_mechanism(str(tmp_path / "arm.yaml"))
-    said = diagnose(load_records(tmp_path / "r.csv", arm, learns=False), arm)
+    effects = ["geometry", "joint_offset", "joint_gain", "gravity", "sag"]
+    said = diagnose(load_records(tmp_path / "r.csv", arm, learns=False), arm, effects=effects)
     assert set(said.verdict["effects"]) == ({"sag", "geometry"} if geometry else {"sag"})
     found = next(e for e in said.effects if e["name"] == "sag")["parameters"]
     assert {block["unit"] for block in found.values()} == {"rad/N/m"}

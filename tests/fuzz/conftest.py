@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import write_table
@@ -28,13 +28,17 @@ tool_frame: unknown
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Give every fuzzer its number of cases: hypothesis reads settings from the function itself."""
+    """Give every fuzzer its number of cases: hypothesis reads settings from the function itself.
+
+    Without any (CASES = 0) its examples are tried alone.
+    """
     count = metafunc.config.getoption("--fuzz-cases")
     inner = getattr(metafunc.function, "hypothesis", None)
     if inner is not None:
         few = getattr(metafunc.module, "CASES", 20)
         metafunc.function._hypothesis_internal_use_settings = settings(
-            max_examples=few if count is None else count,
+            max_examples=max(few, 1) if count is None else count,
+            phases=[Phase.explicit] if count is None and few == 0 else [*Phase],
             derandomize=count is None,
             database=None,
             deadline=None,

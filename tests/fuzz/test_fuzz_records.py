@@ -9,7 +9,7 @@ from fuzz.mutate import change_table, table_changes
 from fuzz.oracle import judged
 
 pytestmark = pytest.mark.fuzz
-CASES = 12
+CASES = 8
 
 _QUICK = ["save_models=false", "save_report=false", "--quiet"]
 COMMANDS = [

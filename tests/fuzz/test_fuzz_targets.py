@@ -32,7 +32,7 @@ from ccnn_torch.compensation.targets.structured_text import print_structured_tex
 from ccnn_torch.errors import MethodFailedError
 
 pytestmark = pytest.mark.fuzz
-CASES = 1
+CASES = 0
 ROWS = 60
 # The parser of Structured Text takes a second for a thousand characters.
 LONGEST = 80_000
@@ -187,7 +187,7 @@ def drawn(compensator: Compensator, seed: int, values: list[float]) -> Array:
 
 @given(kind=st.sampled_from([*MODELS]), single=st.booleans(), seed=st.integers(0, 2**32), values=st.lists(numbers))
 @example("covariates", False, 3, [])
-@example("tripod with effects", False, 0, [])
+@example("sliding arm", False, 0, [])
 def test_every_target_is_the_model(
     home: Path, pytestconfig: Any, kind: str, single: bool, seed: int, values: Any
 ) -> None:

@@ -10,7 +10,8 @@ from ccnn_torch.mechanisms import MachineTool, Mechanism, Stewart, Tripod
 from ccnn_torch.testing import check_mechanism
 
 
-@pytest.mark.parametrize("name", NAMES)
+# A framed hexapod, the longest, is identified in tests/identify/test_framed_set_ups.py; a framed five-bar is left.
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "framed_stewart"])
 def test_conforms(name, tmp_path):
     check_mechanism(make(name, tmp_path))
 

@@ -73,14 +73,14 @@ def test_its_derivatives_are_those_of_statics(arm: BlackBox) -> None:
 
 def test_a_heavier_forearm_is_found(arm: BlackBox) -> None:
     g = torch.Generator().manual_seed(4)
-    joints = arm.sample_joints(40, g)
-    load = {f"load_{c}": 20 * torch.randn(40, generator=g, dtype=torch.float64) for c in "xz"}
+    joints = arm.sample_joints(24, g)
+    load = {f"load_{c}": 20 * torch.randn(24, generator=g, dtype=torch.float64) for c in "xz"}
     built = arm.nominal.numpy() * np.array([1, 1, 1, 1, 1.25])
     force = torch.stack([*load.values()], -1).numpy()
     rows = zip(joints.numpy(), force, strict=True)
     pose = torch.from_numpy(np.stack([_statics(q, f, built) for q, f in rows]))
     pose = pose + 1e-5 * torch.randn(pose.shape, generator=g, dtype=torch.float64)
-    rivals = ["parameter fore mass", "parameter elbow kp", "gravity", "compliance", "joint_offset", "geometry"]
+    rivals = ["parameter fore mass", "parameter elbow kp", "gravity", "compliance"]
     said = diagnose_rows(Situation(arm, joints, load, default_gravity(arm)), pose, effects=rivals)
     assert said.verdict["effects"] == ["parameter fore mass"]
     found = said.effects[0]["parameters"]["fore mass"]

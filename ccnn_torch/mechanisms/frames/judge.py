@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, fit_frames
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form, fit_frames, whole_rows
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.outliers import inlying
 
@@ -19,6 +19,8 @@ _SHARE, _ANGLE = 0.015, 0.03
 _OF_MOTION = 0.2
 # A count of the joints that leaves less than this share of what another leaves is the right one of the two.
 _FAR_BETTER = 0.2
+# Frames are fitted with another count where closed forms, at a hundredth of the cost, halve what is left.
+_WORTH_A_FIT = 0.5
 # More rows than this share are not outliers: another model describes them.
 _OUTLIERS = 0.25
 
@@ -116,16 +118,30 @@ def coupled_count(arm: SerialArm, joints: Tensor, pose: Tensor) -> str | None:
     """
     if len(arm.joints) < 3 or arm.grouped:
         return None
-    left = {}
-    for text, sign in (("q3", 0.0), ("q3 - q2", -1.0), ("q3 + q2", 1.0)):
-        trial = joints.clone()
-        trial[:, 2] += sign * joints[:, 1]
-        values = fit_frames(arm, trial, pose)
-        error = arm.pose_error(arm.forward_kinematics(trial, values), pose)
-        turned = torch.zeros_like(error.position) if error.rotation is None else error.rotation
-        left[text] = float(torch.hypot(error.position, ROTATION_WEIGHT * turned).median())
-    best = min(left, key=lambda text: left[text])
-    return best if best != "q3" and left[best] < _FAR_BETTER * left["q3"] and left[best] < _SHARE * arm.reach else None
+    counts = {"q3": 0.0, "q3 - q2": -1.0, "q3 + q2": 1.0}
+    trials = joints.repeat(len(counts), 1, 1)
+    trials[..., 2] += torch.tensor([*counts.values()], dtype=joints.dtype)[:, None] * joints[:, 1]
+    rivals = [0, 1, 2]
+    if arm.orientation != "direction":
+        weights, whole = whole_rows(pose.expand(len(counts), *pose.shape), None)
+        frames = best_closed_form(*arm.flange(trials), arm.frame(whole), arm.nominal[-6:], weights, ROTATION_WEIGHT)
+        links = arm.nominal[6:-6].expand(len(counts), -1)
+        nearly = _missed(arm, trials, pose, torch.cat([frames[:, :6], links, frames[:, 6:]], -1))
+        rivals = [0, int(nearly.argmin())]
+        if float(nearly.min()) > _WORTH_A_FIT * float(nearly[0]):
+            return None
+    trials = trials[rivals]
+    left = _missed(arm, trials, pose, torch.stack([fit_frames(arm, trial, pose) for trial in trials]))
+    best = int(left.argmin())
+    far_better = float(left[best]) < min(_FAR_BETTER * float(left[0]), _SHARE * arm.reach)
+    return [*counts][rivals[best]] if far_better else None
+
+
+def _missed(arm: SerialArm, joints: Tensor, pose: Tensor, values: Tensor) -> Tensor:
+    """Median distance of rows from poses `s x p`, `c` [m], of joints `c x s x n` and parameters `c x k`."""
+    error = arm.pose_error(arm.forward_kinematics(joints, values[:, None]), pose.expand(len(joints), *pose.shape))
+    turned = torch.zeros_like(error.position) if error.rotation is None else error.rotation
+    return torch.hypot(error.position, ROTATION_WEIGHT * turned).nanmedian(-1).values
 
 
 def _median(size: Tensor, used: Tensor) -> float:
