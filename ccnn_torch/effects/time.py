@@ -194,7 +194,10 @@ class Thermal(Effect):
                 Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
                 for j in mechanism.joints
             ]
-            found.append(Coefficient("warm-up", "1", own * _TAKEN_ON, secondary=True))
+            found += [
+                Coefficient(f"{name} warm-up".strip(), "1", own * _TAKEN_ON, joint, leg, secondary=True)
+                for name, joint, leg in [("", None, None), *((m.name, m.joint, m.leg) for m in _apart(mechanism))]
+            ]
             found += [
                 Coefficient(f"{j.name} warm-up", "1", own, joint=j.name, secondary=True)
                 for j in mechanism.joints
@@ -238,7 +241,7 @@ class Thermal(Effect):
         apart = [longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism)]
         travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
         following = [whole, *apart, travel]
-        timed = [whole, whole, jacobian, whole, travel] if _timed(situation) else []
+        timed = [whole, whole, jacobian, *following] if _timed(situation) else []
         return torch.cat([*following, jacobian, whole, *timed, *following * len(_thermometers(situation))], -1)
 
     def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
@@ -254,7 +257,7 @@ class Thermal(Effect):
             time = situation.covariates["time"]
             body, core = (lagged(time, warm, shape[..., k]) for k in (0, 1))
             own = -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
-            kinds = [(body, following + n), (one, 1), (warm, 1), (core, 1), (warm - body, n), (own, 1 + sliding)]
+            kinds = [(body, following + n), (one, 1), (warm, 1), (core, 1), (warm - body, n), (own, following)]
             others = [lagged(time, other, shape[..., 0]) for other in others]
         kinds += [(other, following) for other in others]
         each = torch.stack(torch.broadcast_tensors(*(k for k, _ in kinds)), -1)  # type: ignore[no-untyped-call]
