@@ -49,6 +49,7 @@ def test_the_library_has_its_order_and_a_line_for_people() -> None:
             "thermal_compliance",
             "sag",
             "gravity",
+            "bending",
             "thermal",
             "drift",
             "homing",
