@@ -70,7 +70,9 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
         write_corrected(folder, diagnosis)
     arrays, labels = picture_arrays(diagnosis, seed)
     mechanism = diagnosis.analysis.situation.mechanism
-    units = covariate_units(mechanism, diagnosis.analysis.situation.covariates) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
+    units = covariate_units(mechanism, diagnosis.analysis.situation.covariates) | {
+        c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)
+    }
     lines = [diagnosis.lines[row] for row in diagnosis.rows_set_aside] if diagnosis.lines else []
     noise = noise_text(diagnosis.noise)
     labels = labels | {"about": {"noise": noise, **(about or {}), "units": units, "lines": lines}}

@@ -69,11 +69,15 @@ def _bending_load(machine: Machine, rng: Random) -> Cause:
     """The same under the recorded load alone: the own weight was there when the machine was calibrated."""
     bent = _beams(machine, rng, 0.0, np.array([30.0, 30.0, 30.0]))
     return Cause(
-        ("bending", "compliance"), moved=lambda pose, rows, k: bent(pose, rows.joints, k, 0.0, rows.load), needs=("load",)
+        ("bending", "compliance"),
+        moved=lambda pose, rows, k: bent(pose, rows.joints, k, 0.0, rows.load),
+        needs=("load",),
     )
 
 
-def _beams(machine: Machine, rng: Random, usual: float, pulled: Array) -> Callable[[Pose, Array, float, float, Array], Pose]:
+def _beams(
+    machine: Machine, rng: Random, usual: float, pulled: Array
+) -> Callable[[Pose, Array, float, float, Array], Pose]:
     """Euler-Bernoulli beams of one section each, clamped at the joint before: three links at most are soft.
 
     usual, pulled: weight [1] and load [N] under which the beams give as much as ordinary ones.
@@ -112,11 +116,7 @@ def _beams(machine: Machine, rng: Random, usual: float, pulled: Array) -> Callab
                 + twist * along * twisting
                 + np.cross(axis, flat(line)) * along**3 / 6
             )
-            sunk = (
-                flat(force) * along**3 / 3
-                + np.cross(flat(moment), axis) * along**2 / 2
-                + flat(line) * along**4 / 8
-            )
+            sunk = flat(force) * along**3 / 3 + np.cross(flat(moment), axis) * along**2 / 2 + flat(line) * along**4 / 8
             shift += k * softness[i] * (sunk + np.cross(turned, pose[0] - end))
             turn += k * softness[i] * turned
         rotation = np.stack([_small(t) for t in turn])

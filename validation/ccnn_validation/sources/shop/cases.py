@@ -68,7 +68,11 @@ def built(dealt: Dealt, seed: int, more: Mapping[str, Callable[[Machine, Random]
     if first in ("transmission", "latency", "geometry", "wear") or dealt.kind == "pair" or free:
         plan = "random"
     count = int(rng.integers(120, 401))
-    causes = [{**LIBRARY, **OUTSIDE, **(more or {})}[name](machine, rng) for name in dealt.causes] if dealt.kind != "none" else []
+    causes = (
+        [{**LIBRARY, **OUTSIDE, **(more or {})}[name](machine, rng) for name in dealt.causes]
+        if dealt.kind != "none"
+        else []
+    )
     needs = [need for cause in causes for need in cause.needs]
     needs += ["temperature", "time"] if first == "tempdrift" else []
     rows = (
