@@ -351,7 +351,7 @@ def test_covariates_are_columns_with_units_and_the_same_for_the_same_seed() -> N
 
 
 def test_a_clamped_beam_gives_as_the_textbook_says_at_its_end_and_what_it_carries() -> None:
-    """A crane: a mast that turns, a boom of 2 m and one of 0.5 m beyond it; pulled down by 30 N at the tip."""
+    """A crane: a mast that turns, a boom of 2 m, and a second one of 0.5 m beyond it; pulled down by 30 N at the tip."""
     arm = SerialArm("crane", "standard", [[0.0, 0.0, 0.7, 0.0], [2.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0]])
     joints, load, long, beyond = torch.zeros(1, 3, dtype=torch.float64), -30.0, 2.0, 0.5
     rows = Situation(arm, joints, {"load_z": torch.tensor([load], dtype=torch.float64)}, default_gravity(arm))

@@ -83,8 +83,7 @@ def driver_words(driver: str | None) -> str:
     """What `verdict.driver` is called in a sentence.
 
     Args:
-        driver: `workspace`, `joint qN`, `load NAME`, `temperature` or `temperature NAME`, `direction N`, `time`, or
-            None where none is known.
+        driver: `workspace`, `joint qN`, `load NAME`, `temperature` or `temperature NAME`, `direction N`, `time`, or None where none is known.
     """
     if driver is None:
         return "nothing that was recorded"

@@ -75,11 +75,6 @@ def _bending_load(machine: Machine, rng: Random) -> Cause:
     )
 
 
-def _across(vectors: Array, axis: Array) -> Array:
-    """The part across an axis, `s x 3` each."""
-    return np.asarray(vectors - (vectors * axis).sum(1, keepdims=True) * axis)
-
-
 def _beams(
     machine: Machine, rng: Random, usual: float, pulled: Array
 ) -> Callable[[Pose, Array, float, float, Array], Pose]:
@@ -113,18 +108,15 @@ def _beams(
             tool = masses[-1] * machine.down
             force, moment = force + tool, moment + np.cross(pose[0] - end, np.broadcast_to(tool, end.shape))
             line = masses[i] * machine.down / along
+            flat = lambda v: v - (v * axis).sum(1, keepdims=True) * axis  # noqa: E731
             twist = (moment * axis).sum(1, keepdims=True) * axis
             turned = (
-                np.cross(axis, _across(force, axis)) * along**2 / 2
-                + _across(moment, axis) * along
+                np.cross(axis, flat(force)) * along**2 / 2
+                + flat(moment) * along
                 + twist * along * twisting
-                + np.cross(axis, _across(line, axis)) * along**3 / 6
+                + np.cross(axis, flat(line)) * along**3 / 6
             )
-            sunk = (
-                _across(force, axis) * along**3 / 3
-                + np.cross(_across(moment, axis), axis) * along**2 / 2
-                + _across(line, axis) * along**4 / 8
-            )
+            sunk = flat(force) * along**3 / 3 + np.cross(flat(moment), axis) * along**2 / 2 + flat(line) * along**4 / 8
             shift += k * softness[i] * (sunk + np.cross(turned, pose[0] - end))
             turn += k * softness[i] * turned
         rotation = np.stack([_small(t) for t in turn])
