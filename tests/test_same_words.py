@@ -83,6 +83,6 @@ def test_what_no_command_knows_is_refused_with_the_nearest_key(
     config.write_text(text.replace("split:", "splt:"))
     with pytest.raises(Exception, match="there is no key 'splt'; did you mean 'split'"):
         load(config)
-    config.write_text(text + "engine: local\nmethods: [gp]\ngp: {steps: 3}\n")
+    config.write_text(text + "methods: [gp]\ngp: {steps: 3}\n")
     load(config, (), notes.append)
-    assert "engine, gp, methods" in notes[-1]
+    assert "gp, methods" in notes[-1]
