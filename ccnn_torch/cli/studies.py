@@ -235,7 +235,7 @@ def blind_check(
         str, typer.Option(help="Any of single, pair, none, outside, separated by commas.")
     ] = "single,pair,none,outside",
     source: Annotated[
-        str, typer.Option(help="Who made the cases: blind, semi_real, multibody, adversarial, motion or shop.")
+        str, typer.Option(help="Who made the cases: blind, semi_real, multibody, adversarial, motion, shop, since.")
     ] = "blind",
     engine: Annotated[
         str | None,
