@@ -25,6 +25,11 @@ def torque_of(joint: Coordinate) -> str:
     return f"torque_{joint.name}"
 
 
+def is_temperature(name: str) -> bool:
+    """Whether a column is a temperature: `temperature`, and `temperature_NAME` of a part of the machine."""
+    return name == "temperature" or name.startswith("temperature_")
+
+
 def force_of(unit: str) -> str:
     """Unit of the force or moment along a coordinate of this unit."""
     return "N" if unit == "m" else "N*m"

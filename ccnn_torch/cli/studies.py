@@ -183,11 +183,11 @@ def simulate(
 
     OUT.csv has the commanded joints, the measured pose and the conditions (time, temperature, loads, directions of
     approach; speeds along moves). Effects: geometry, joint_offset, joint_gain, transmission, backlash, friction,
-    compliance, thermal_compliance, sag (with columns of torques), gravity, thermal, drift, homing (on four days),
-    frame, frame_drift, tool, coupling, latency, flexure (of directions: key orientation=direction of an arm),
-    instrument, outlier (bad rows), or your own as path/to/file.py:Name. An effect without parameters is drawn in a
-    plausible size; size=2 makes that twice as large. Given parameters are SI numbers or have a unit (q1=0.1mm); blanks
-    in names may be underscores; parameters that are not given are 0.
+    compliance, thermal_compliance, sag (with columns of torques), gravity, bending (an arm), thermal, drift,
+    homing (on four days), frame, frame_drift, tool, coupling, latency, flexure (of directions: key
+    orientation=direction of an arm), instrument, outlier (bad rows), or your own as path/to/file.py:Name. An
+    effect without parameters is drawn in a plausible size; size=2 makes that twice as large. Given parameters are
+    SI numbers or have a unit (q1=0.1mm); blanks in names may be underscores; parameters that are not given are 0.
     Keys: mechanism_keys, covariates, rows, duration, step, move, way, load, moment, gravity, max_condition,
     rotation_weight.
 
@@ -235,7 +235,7 @@ def blind_check(
         str, typer.Option(help="Any of single, pair, none, outside, separated by commas.")
     ] = "single,pair,none,outside",
     source: Annotated[
-        str, typer.Option(help="Who made the cases: blind, semi_real, multibody, adversarial, motion or shop.")
+        str, typer.Option(help="Who made the cases: blind, semi_real, multibody, adversarial, motion, shop, since.")
     ] = "blind",
     engine: Annotated[
         str | None,

@@ -373,7 +373,7 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         if isinstance(situation.mechanism, Instrument):
             situation = situation.visits
             values = values[..., : len(situation.mechanism.geometry)]
-        return found_block(situation, values, acting, covariate_units(situation.mechanism))
+        return found_block(situation, values, acting, covariate_units(situation.mechanism, used))
     except InputError:
         # A machine that no file describes, or an effect that needs what was before a row.
         return None

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import force_of, torque_of
+from ccnn_torch.coordinates import force_of, is_temperature, torque_of
 from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation
 from ccnn_torch.effects.time import ROW
@@ -97,9 +97,13 @@ def torques_elsewhere(rows: Situation, there: Situation) -> dict[str, Tensor]:
     return found
 
 
-def covariate_units(mechanism: Mechanism) -> dict[str, str]:
-    """SI unit of every column that the library's effects know, or the machine itself takes, by name."""
+def covariate_units(mechanism: Mechanism, names: Iterable[str] = ()) -> dict[str, str]:
+    """SI unit of every column that the library's effects know, or the machine itself takes, by name.
+
+    names: of columns that are there; a machine may have any number of thermometers.
+    """
     units = {c.name: c.unit for c in mechanism.takes} | {"time": "s", ROW: "1", "temperature": "K"}
+    units |= {name: "K" for name in names if is_temperature(name)}
     units |= {f"load_{c.name}": force_of(c.unit) for c in inside(mechanism).pose}
     units |= {torque_of(j): force_of(j.unit) for j in mechanism.joints}
     units |= {f"direction{i + 1}": "1" for i in range(len(mechanism.joints))}

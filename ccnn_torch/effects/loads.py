@@ -306,6 +306,86 @@ class Gravity(Effect):
         return torch.cat([columns, _off_centre(situation)], -1) if _centred(situation) else columns
 
 
+# What a beam does under what pulls at its end.
+_OF_BEAM = ("", " twist")
+
+
+class Bending(Effect):
+    """Links of an arm that bend and twist between their joints as beams of one section, clamped at the joint before.
+
+    Under a force F and a moment M at its end a beam of length L gives F L³ / 3EI + M L² / 2EI and turns by
+    F L² / 2EI + M L / EI (Euler and Bernoulli), and by M L / GJ about itself. Coefficients of a link: 1/EI for the
+    recorded load; weight / EI for own weight, 1 N of which is spread evenly over the origins of the links and the tool.
+    Secondary: the same for a weight at the tool alone, and of each 1/GJ; and for the weight of the link itself along
+    it, which gives F L³ / 8EI and turns by F L² / 6EI. To first order about the nominal pose.
+    """
+
+    name = "bending"
+    kind = "pose"
+    description = "links of an arm that bend between their joints under their own weight or a load"
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Links, and positions."""
+        if not isinstance(inside(mechanism), SerialArm):
+            return "links one after the other: the legs of a machine give as its members do, by 'compliance'"
+        return "positions: what bends turns a direction as flexure does" if sees_directions(mechanism) else ""
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """By load (where one was recorded), by weight, by a weight at the tool and by the link's own, link by link."""
+        kinds = [(f"weight{part}", "rad/m^2", PLATFORM_WEIGHT) for part in _OF_BEAM]
+        kinds += [(pull, "rad/m^2", _SECONDARY * PLATFORM_WEIGHT) for pull in ("tool", "tool twist", "own")]
+        if situation.loaded:
+            kinds = [(f"load{part}", "rad/N/m^2", 1.0) for part in _OF_BEAM] + kinds
+        main = ("load", "weight")
+        return tuple(
+            Coefficient(f"link {i + 1} {kind}", unit, GIVE["rad"] * size, joint.name, None, kind not in main)
+            for i, joint in enumerate(situation.mechanism.joints)
+            for kind, unit, size in kinds
+        )
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x c x m`."""
+        arm = situation.whole.mechanism
+        assert isinstance(arm, SerialArm)
+        points, _ = arm_axes(arm, situation.joints, arm.resolve(situation.whole.parameters))
+        tool = situation.platform[0].unsqueeze(-2)
+        ends = torch.cat([points[..., 1:, :], tool.expand_as(points)[..., :1, :]], -2)
+        beam, beyond, n = ends - points, tool - ends, points.shape[-2]
+        down = situation.down.unsqueeze(-2).expand_as(beam)
+        # What hangs at the end of link j acts on link i ≤ j.
+        onward = torch.ones(n, n, dtype=points.dtype).triu() / n
+        lever = (onward[..., None] * (ends.unsqueeze(-3) - ends.unsqueeze(-2))).sum(-2)
+        pulls = [(onward.sum(-1, keepdim=True) * down, _cross(lever, down)), (down, _cross(beyond, down))]
+        if situation.loaded:
+            wrench = situation.whole.wrench.unsqueeze(-2)
+            moment = _cross(beyond, wrench[..., :3])
+            pulls.insert(0, (wrench[..., :3], moment + wrench[..., 3:] if wrench.shape[-1] == 6 else moment))
+        bent = [_of_beam(beam, *pull, beyond) for pull in pulls]
+        own = _of_beam(beam, down, torch.zeros_like(beam), beyond, (1 / 6, 1 / 8))[..., :1, :]
+        columns = torch.cat([*bent, own], -2).flatten(-3, -2)
+        return situation.visible @ columns[..., : situation.jacobian.shape[-2]].mT
+
+
+def _of_beam(
+    beam: Tensor, force: Tensor, moment: Tensor, beyond: Tensor, shares: tuple[float, float] = (1 / 2, 1 / 3)
+) -> Tensor:
+    """Shift and turn of a point by clamped beams of EI = 1 that bend, and of GJ = 1 that twist, under what pulls at
+    their ends; all `... x n x 3` but the result, `... x n x 2 x 6`; beyond: from the end to the point; shares: by which
+    a force turns and shifts the end, times L² and L³."""
+    length = torch.linalg.vector_norm(beam, dim=-1, keepdim=True)
+    along = beam / length.clamp_min(1e-12)
+    twist = length * (moment * along).sum(-1, keepdim=True) * along
+    across = force - (force * along).sum(-1, keepdim=True) * along
+    turn = length * (shares[0] * _cross(beam, force) + moment) - twist
+    sink = length * (shares[1] * length.square() * across + _cross(moment, beam) / 2)
+    both = [torch.cat([_cross(turn, beyond) + sink, turn], -1), torch.cat([_cross(twist, beyond), twist], -1)]
+    return torch.stack(both, -2)
+
+
+def _cross(first: Tensor, second: Tensor) -> Tensor:
+    return torch.linalg.cross(*torch.broadcast_tensors(first, second), dim=-1)  # type: ignore[no-untyped-call, no-any-return]
+
+
 def _centred(situation: Situation) -> bool:
     """Whether the platform's centre of mass has columns: it turns, and is no arm's, whose tool is small."""
     return not isinstance(inside(situation.mechanism), SerialArm) and situation.platform[1] is not None

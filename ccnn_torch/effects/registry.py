@@ -17,7 +17,7 @@ from torch import Tensor
 from ccnn_torch.effects.backlash import Backlash, Friction
 from ccnn_torch.effects.constant import Flexure, Frame, Geometry, Instrument, Tool, parameter_causes
 from ccnn_torch.effects.joints import Coupling, JointGain, JointOffset, Transmission
-from ccnn_torch.effects.loads import Compliance, Gravity, Sag, ThermalCompliance
+from ccnn_torch.effects.loads import Bending, Compliance, Gravity, Sag, ThermalCompliance
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.effects.time import Drift, FrameDrift, Homing, Latency, Thermal
@@ -341,6 +341,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "thermal_compliance": ThermalCompliance,
     "sag": Sag,
     "gravity": Gravity,
+    "bending": Bending,
     "thermal": Thermal,
     "drift": Drift,
     "homing": Homing,
@@ -395,7 +396,7 @@ def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
 
 def effect_names(mechanism: Mechanism) -> list[str]:
     """Of the library's effects that such a machine may have, and of the causes that its own parameters name."""
-    without = ("gravity", "tool", "instrument") if sees_directions(mechanism) else (Flexure.name,)
+    without = ("gravity", "bending", "tool", "instrument") if sees_directions(mechanism) else (Flexure.name,)
     library = [name for name in EFFECTS if name not in without]
     return [*library, *(e.name for e in parameter_causes(mechanism))]
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import is_temperature
 from ccnn_torch.effects.columns import TWIST, OfJoints, by_joint, of_rows, shown_columns
 from ccnn_torch.effects.constant import frame_columns
 from ccnn_torch.effects.joints import JointOffset
@@ -16,6 +17,7 @@ from ccnn_torch.effects.loads import Member, members
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import REFERENCE, Situation
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.records.commanded import SECOND
 
 # Rows farther apart are not one trajectory [s].
 _SAME_MOTION = 1.0
@@ -150,8 +152,8 @@ class Thermal(Effect):
     at the first row. Without a column of times there is no lag. Secondary: mounts that move a joint by γ_i θ; a
     reference that was not 20 degC (a constant growth); beams that bend by what the surroundings are ahead of the body,
     T - θ; parts of the growth that follow at once, or with a lag of their own (a core in its skin); and the drives' own
-    warmth, which no thermometer in the hall
-    sees: growth of all and of the sliding drives by 1 - exp(-t / 2000 s).
+    warmth, which no thermometer in the hall sees: growth of all and of the sliding drives by 1 - exp(-t / 2000 s). By
+    each further thermometer, `temperature_NAME`, growth of all these parts by what it shows beyond the first one.
 
     Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
     derivatives, so the effect is one on the pose: no joint has to replace a length (near a singularity of an arm
@@ -192,12 +194,21 @@ class Thermal(Effect):
                 Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
                 for j in mechanism.joints
             ]
-            found.append(Coefficient("warm-up", "1", own * _TAKEN_ON, secondary=True))
+            found += [
+                Coefficient(f"{name} warm-up".strip(), "1", own * _TAKEN_ON, joint, leg, secondary=True)
+                for name, joint, leg in [("", None, None), *((m.name, m.joint, m.leg) for m in _apart(mechanism))]
+            ]
             found += [
                 Coefficient(f"{j.name} warm-up", "1", own, joint=j.name, secondary=True)
                 for j in mechanism.joints
                 if j.unit == "m"
             ]
+        following = found[: 1 + len(_apart(mechanism)) + sum(j.unit == "m" for j in mechanism.joints)]
+        found += [
+            replace(c, name=f"{c.name} {name.partition('_')[2]}", secondary=True, positive=False)
+            for name in _thermometers(situation)
+            for c in following
+        ]
         return tuple(found)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
@@ -229,28 +240,37 @@ class Thermal(Effect):
         whole = longer[..., lengths].sum(-1, keepdim=True)
         apart = [longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism)]
         travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
-        parts = [whole, *apart, travel, jacobian, whole]
-        return torch.cat([*parts, *([whole, whole, jacobian, whole, travel] if _timed(situation) else [])], -1)
+        following = [whole, *apart, travel]
+        timed = [whole, whole, jacobian, *following] if _timed(situation) else []
+        return torch.cat([*following, jacobian, whole, *timed, *following * len(_thermometers(situation))], -1)
 
     def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
         """What each of the fixed columns is multiplied by: warmth [K], or what has become of it, `... x s x m`."""
         mechanism = situation.mechanism
-        warm = (situation.covariates["temperature"] - REFERENCE).expand(situation.joints.shape[:-1])
+        hall = situation.covariates["temperature"].expand(situation.joints.shape[:-1])
+        warm, others = hall - REFERENCE, [situation.covariates[name] - hall for name in _thermometers(situation)]
         n, sliding = len(mechanism.joints), sum(j.unit == "m" for j in mechanism.joints)
-        following, one = 1 + len(_apart(mechanism)) + sliding + n, torch.ones_like(warm)
+        following, one = 1 + len(_apart(mechanism)) + sliding, torch.ones_like(warm)
         if not _timed(situation):
-            kinds = [(warm, following), (one, 1)]
+            kinds = [(warm, following + n), (one, 1)]
         else:
             time = situation.covariates["time"]
             body, core = (lagged(time, warm, shape[..., k]) for k in (0, 1))
             own = -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
-            kinds = [(body, following), (one, 1), (warm, 1), (core, 1), (warm - body, n), (own, 1 + sliding)]
+            kinds = [(body, following + n), (one, 1), (warm, 1), (core, 1), (warm - body, n), (own, following)]
+            others = [lagged(time, other, shape[..., 0]) for other in others]
+        kinds += [(other, following) for other in others]
         each = torch.stack(torch.broadcast_tensors(*(k for k, _ in kinds)), -1)  # type: ignore[no-untyped-call]
         return each[..., [i for i, (_, count) in enumerate(kinds) for _ in range(count)]]
 
 
 def _timed(situation: Situation) -> bool:
     return "time" in situation.covariates
+
+
+def _thermometers(situation: Situation) -> list[str]:
+    """Columns of the temperatures of parts, `temperature_NAME`."""
+    return [n for n in situation.covariates if is_temperature(n) and n != "temperature" and not n.endswith(SECOND)]
 
 
 def _apart(mechanism: Mechanism) -> list[Member]:

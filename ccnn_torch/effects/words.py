@@ -98,6 +98,12 @@ _WORDS = {
         "of the weight beyond the model's, or where the gain is not given the angle by which the command must lead.",
         "Counterbalance, brake and bearings of {where}, and the payload that the controller knows.",
     ),
+    "bending": Words(
+        "links that bend between their joints",
+        "bending",
+        "1 / (E I) of a link as a beam, for each unit of load; of weight and tool that times the weight.",
+        "{where}: what the tube, casting or extension is made of, and its bolts.",
+    ),
     "thermal": Words(
         "growth with temperature",
         "thermal growth",

@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 from numpy.typing import NDArray
 
-from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.coordinates import Coordinate, is_temperature
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.table import FILE, Table
 from ccnn_torch.spelling import hint, nearest
@@ -19,7 +19,7 @@ _EXTREME = 1e3
 # A column that varies by less than this share is constant but for how its numbers were written.
 _SAME = 1e-14
 
-DEFAULT_COVARIATES = ("time", "temperature", "load_*", "torque_*", "direction*", "speed*")
+DEFAULT_COVARIATES = ("time", "temperature", "temperature_*", "load_*", "torque_*", "direction*", "speed*")
 
 
 def choose_covariates(
@@ -120,7 +120,7 @@ def _si_unit(name: str, table: Table, pose: Mapping[str, str], joints: Mapping[s
 def _allowed(name: str, pose: Mapping[str, str], joints: Mapping[str, str]) -> tuple[str, ...]:
     if name == "time":
         return ("s",)
-    if name == "temperature":
+    if is_temperature(name):
         return ("K",)
     if name.startswith("load_"):
         # A force along a length, a moment about an angle; for another name either.

@@ -228,7 +228,7 @@ def test_a_machine_that_grows_evenly_is_the_same_machine_larger(name: str) -> No
     # The members together are the whole.
     effect = make_effect("thermal")
     parts = columns(effect, rows, torch.tensor([500.0, 4000.0], dtype=torch.float64))
-    legs = [v for k, v in parts.items() if k.startswith("leg ")]
+    legs = [v for k, v in parts.items() if k.startswith("leg ") and not k.endswith("warm-up")]
     assert torch.allclose(sum(legs[1:], legs[0]), parts["growth"])
 
 
@@ -348,3 +348,22 @@ def test_covariates_are_columns_with_units_and_the_same_for_the_same_seed() -> N
     assert all(torch.equal(one[name], two[name]) for name in one) and set(one) <= set(covariate_units(machine))
     assert torch.equal(one["direction4"][1:], torch.sign(joints[:, 3].diff()))
     assert 285 < float(one["temperature"].min()) < float(one["temperature"].max()) < 305
+
+
+def test_a_clamped_beam_gives_as_the_textbook_says_at_its_end_and_what_it_carries() -> None:
+    """A crane: a mast that turns, a boom of 2 m and one of 0.5 m beyond it; pulled down by 30 N at the tip."""
+    arm = SerialArm("crane", "standard", [[0.0, 0.0, 0.7, 0.0], [2.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0]])
+    joints, load, long, beyond = torch.zeros(1, 3, dtype=torch.float64), -30.0, 2.0, 0.5
+    rows = Situation(arm, joints, {"load_z": torch.tensor([load], dtype=torch.float64)}, default_gravity(arm))
+    found = columns(make_effect("bending"), rows, NO_SHAPE)["link 2 load"][0]
+    turn = load * long**2 / 2 + load * beyond * long
+    sink = load * long**3 / 3 + load * beyond * long**2 / 2 + turn * beyond
+    wanted = torch.tensor([0, 0, sink, 0, -turn, 0], dtype=torch.float64)
+    assert torch.allclose(found, wanted[: len(found)], atol=1e-9)
+
+
+def test_lengths_grow_with_each_further_thermometer_by_what_it_shows_beyond_the_first() -> None:
+    rows = situation("tripod")
+    hotter = replace(rows, covariates={**rows.covariates, "temperature_drives": rows.covariates["temperature"] + 5})
+    by = columns(make_effect("thermal"), hotter, torch.zeros(2, dtype=torch.float64))
+    assert torch.allclose(by["growth drives"], 5 * by["reference"])

@@ -14,6 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import is_temperature
 from ccnn_torch.diagnosis.candidates.atom import Atom, discrepancy
 from ccnn_torch.effects import Situation
 from ccnn_torch.effects.columns import shown_columns
@@ -101,7 +102,7 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str], rows: int)
             found.append(
                 _atom(situation, driver, _load_features(_under(situation, name)), most=most, log_odds=_NEAR_LIBRARY)
             )
-        if driver == "temperature" and "time" in situation.covariates:
+        if is_temperature(name) and "time" in situation.covariates:
             features += [_lagged(value, situation.covariates["time"], k) for k in _LAGS]
         found.append(_atom(situation, driver, torch.cat(features, -1)))
         if " " in driver:
@@ -127,7 +128,9 @@ def driver_of(name: str) -> str | None:
         return f"direction {name.removeprefix('direction')}"
     if name.startswith(SPEED):
         return f"{SPEED} {name.removeprefix(SPEED)}"
-    return name if name in ("temperature", "time") else None
+    if is_temperature(name):
+        return name.replace("_", " ", 1)
+    return name if name == "time" else None
 
 
 def unit_range(values: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.coordinates import Coordinate, is_temperature
 from ccnn_torch.diagnosis.checks.identifiable import Check
 from ccnn_torch.diagnosis.mount import machine_as_told
 from ccnn_torch.diagnosis.page.data import CORRECTED, NEXT, RESULT, about_of
@@ -70,7 +70,9 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
         write_corrected(folder, diagnosis)
     arrays, labels = picture_arrays(diagnosis, seed)
     mechanism = diagnosis.analysis.situation.mechanism
-    units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
+    units = covariate_units(mechanism, diagnosis.analysis.situation.covariates) | {
+        c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)
+    }
     lines = [diagnosis.lines[row] for row in diagnosis.rows_set_aside] if diagnosis.lines else []
     noise = noise_text(diagnosis.noise)
     labels = labels | {"about": {"noise": noise, **(about or {}), "units": units, "lines": lines}}
@@ -100,9 +102,7 @@ Column = tuple[str, str, Tensor]
 """Name, SI unit and values."""
 # Quantile bins of a driver; the one whose bins hold most of an effect's variance is the signature of the effect.
 _BINS = 12
-_UNITS = {"time": "s", "temperature": "K"}
-# A driver outside the library that is one column by its name.
-_COLUMN = {"temperature": "temperature", "time": "time"}
+_UNITS = {"time": "s"}
 
 
 def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -300,13 +300,14 @@ def _drivers(analysis: Analysis, place: Tensor) -> list[Column]:
 def _unit(name: str) -> str:
     if name.startswith("load_"):
         return "N*m" if name.startswith("load_r") else "N"
-    return _UNITS.get(name, "1")
+    return "K" if is_temperature(name) else _UNITS.get(name, "1")
 
 
 def _telling(view: _View, keep: Tensor, cause: str) -> tuple[float, Column]:
     """The column that a cause follows, and how well: the one that its name says, else the one that it follows best."""
     kind, _, which = cause.partition(" ")
-    wanted = {"joint": which, "load": f"load_{which}", "direction": f"direction{which}"}.get(kind, _COLUMN.get(cause))
+    columns = {"joint": which, "direction": f"direction{which}"}
+    wanted = columns.get(kind, cause.replace(" ", "_"))
     named = [c for c in view.drivers if c[0] == wanted] or view.drivers
     shares = [_share(c[2][keep], view.fit[keep]) for c in named]
     best = max(range(len(named)), key=lambda i: shares[i])

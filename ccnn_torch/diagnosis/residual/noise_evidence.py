@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import is_temperature
 from ccnn_torch.diagnosis.residual.correlation import FEWEST_TARGETS
 from ccnn_torch.effects import Situation, measured_channels, pose_residual
 from ccnn_torch.records import Records
@@ -20,8 +21,6 @@ _FEWEST = 20
 # What a column of standard deviations may be called, `{}` being the coordinate.
 _NAMES = ("s{}", "sd_{}", "std_{}", "sigma_{}")
 _ANGLES = {"rx": "seuler_x", "ry": "seuler_y", "rz": "seuler_z"}
-# Covariates that may differ between readings under the same conditions.
-_FREE = ("time", "temperature")
 
 
 class Noise(NamedTuple):
@@ -45,7 +44,8 @@ def noise_of_repeats(situation: Situation, measured: Tensor) -> Noise | None:
         situation: `s` rows.
         measured: poses, `s x p` [SI].
     """
-    held = [v[:, None] for name, v in situation.covariates.items() if name not in _FREE]
+    # Time and temperatures may differ between readings under the same conditions.
+    held = [v[:, None] for name, v in situation.covariates.items() if name != "time" and not is_temperature(name)]
     # Readings of different corners or anchors are none of one target.
     held.append(measured[:, situation.mechanism.compared :].nan_to_num())
     residual, seen = pose_residual(situation, measured), measured_channels(situation, measured)

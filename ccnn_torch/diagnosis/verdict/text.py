@@ -83,13 +83,15 @@ def driver_words(driver: str | None) -> str:
     """What `verdict.driver` is called in a sentence.
 
     Args:
-        driver: `workspace`, `joint qN`, `load NAME`, `temperature`, `direction N`, `time`, or None where none is known.
+        driver: `workspace`, `joint qN`, `load NAME`, `temperature` or `temperature NAME`, `direction N`, `time`, or
+            None where none is known.
     """
     if driver is None:
         return "nothing that was recorded"
     kind, _, name = driver.partition(" ")
     load = f"the load along {name}" if name in ("x", "y", "z") else f"the load's moment {name}"
     named = {"joint": f"joint {name}", "load": load, "direction": f"the direction of joint {name}"}
+    named["temperature"] = f"the temperature {name}"
     return _DRIVERS.get(driver) or (named.get(kind) if name else None) or driver
 
 

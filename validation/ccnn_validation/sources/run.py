@@ -34,7 +34,7 @@ __all__ = ["SOURCES", "diagnosed", "run_source", "source_of"]
 
 _Task = tuple[str, str, int, Path]
 """Source, family, seed, and the file of its answer."""
-SOURCES = ("semi_real", "multibody", "adversarial", "motion", "shop")
+SOURCES = ("semi_real", "multibody", "adversarial", "motion", "shop", "since")
 
 
 def source_of(name: str) -> Source:

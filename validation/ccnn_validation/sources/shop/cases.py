@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import combinations, product
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ccnn_validation.sources.case import SourceCase, Truth
 from ccnn_validation.sources.shop.arms import ARMS, arm
 from ccnn_validation.sources.shop.box import Gantry
-from ccnn_validation.sources.shop.cause import Cause, seen
+from ccnn_validation.sources.shop.cause import Cause, Random, seen
 from ccnn_validation.sources.shop.columns import file_columns, pose_columns
 from ccnn_validation.sources.shop.covariates import in_motion, measured_rows
 from ccnn_validation.sources.shop.deal import Dealt
@@ -53,8 +53,8 @@ def machine_of(name: str, frames: str = "identity") -> Machine:
     return others[name]()
 
 
-def built(dealt: Dealt, seed: int) -> SourceCase:
-    """The case that was dealt."""
+def built(dealt: Dealt, seed: int, more: Mapping[str, Callable[[Machine, Random], Cause]] | None = None) -> SourceCase:
+    """The case that was dealt; more: causes besides those of the workshop."""
     rng = np.random.default_rng([seed, zlib.crc32(dealt.name.encode())])
     first = dealt.causes[0]
     # With frames to be found, these would be no error of the machine.
@@ -68,18 +68,24 @@ def built(dealt: Dealt, seed: int) -> SourceCase:
     if first in ("transmission", "latency", "geometry", "wear") or dealt.kind == "pair" or free:
         plan = "random"
     count = int(rng.integers(120, 401))
-    causes = [(LIBRARY | OUTSIDE)[name](machine, rng) for name in dealt.causes] if dealt.kind != "none" else []
+    causes = (
+        [{**LIBRARY, **OUTSIDE, **(more or {})}[name](machine, rng) for name in dealt.causes]
+        if dealt.kind != "none"
+        else []
+    )
     needs = [need for cause in causes for need in cause.needs]
     needs += ["temperature", "time"] if first == "tempdrift" else []
     rows = (
         in_motion(machine, count, needs, rng) if "speed" in needs else measured_rows(machine, count, plan, needs, rng)
     )
+    for cause in causes:
+        rows.columns.update(cause.adds(rows) if cause.adds else {})
     strongest = _STRONGEST_OF_TWO if dealt.kind == "pair" else _STRONGEST
     channels = slice(2) if machine.axes == "xy" else slice(6 if full else 3)
     sigma, strengths = _noise(machine, rows, causes, strongest, channels, rng)
     clean = seen(machine, rows, causes, strengths)
     spread = sigma / np.array([1, 1, 1, _ARM, _ARM, _ARM])
-    error = _drawn(first, len(rows.joints), rng) * spread
+    error = _drawn(first, clean[0], rng) * spread
     place, rotation = clean[0] + error[:, :3], Rotation.from_rotvec(error[:, 3:]).as_matrix() @ clean[1]
     turn, shift = Rotation.identity(), np.zeros(3)
     if free:
@@ -118,14 +124,26 @@ def _noise(
     return sigma, [float(np.clip(w * sigma / gap, 0.33, 3)) for w, gap in zip(wanted, gaps, strict=True)]
 
 
-def _drawn(kind: str, rows: int, rng: np.random.Generator) -> Array:
-    """Noise of unit variance, `s x 6`: white, of heavy tails (`t3`), or related from row to row (`ar1`)."""
+def _drawn(kind: str, places: Array, rng: np.random.Generator) -> Array:
+    """Noise of unit variance, `s x 6`: white, of heavy tails (`t3`), related from row to row (`ar1`), or with channels
+    that share it: all alike (`correlated`), or most of it across the line of sight of a tracker (`range_azimuth`)."""
+    rows = len(places)
     noise = rng.standard_normal((rows, 6))
     if kind == "t3":
         return np.asarray(rng.standard_t(3, noise.shape) / np.sqrt(3))
     if kind == "ar1":
         for i in range(1, rows):
             noise[i] = 0.7 * noise[i - 1] + np.sqrt(1 - 0.49) * noise[i]
+    if kind == "correlated":
+        mixed = rng.normal(size=(3, 3))
+        cov = mixed @ mixed.T + 0.05 * np.eye(3)
+        noise[:, :3] = noise[:, :3] @ np.linalg.cholesky(cov).T / np.sqrt(np.trace(cov) / 3)
+    if kind == "range_azimuth":
+        # A tracker 2 to 4 m away: 5 times as good along its line of sight as across it.
+        sight = places - places.mean(0) - Rotation.random(random_state=rng).apply([rng.uniform(2, 4), 0, 0])
+        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        along = (noise[:, :3] * sight).sum(1, keepdims=True) * sight
+        noise[:, :3] = (noise[:, :3] - 0.8 * along) / np.sqrt((2 + 0.2**2) / 3)
     return noise
 
 

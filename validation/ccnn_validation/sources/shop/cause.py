@@ -26,12 +26,14 @@ class Cause:
         errors: errors of joints and sizes at rows, for a strength.
         moved: the pose with what moves it as a whole, for a strength; None = nothing does.
         needs: columns without which it cannot be found: direction, load, temperature, time or speed.
+        adds: columns of its own that were recorded as well, at rows; None = none.
     """
 
     answers: tuple[str, ...]
     errors: Callable[[Rows, float], Errors] = lambda rows, strength: {}
     moved: Callable[[Pose, Rows, float], Pose] | None = None
     needs: tuple[str, ...] = ()
+    adds: Callable[[Rows], dict[str, Array]] | None = None
 
 
 def with_joints(name: str, errors: Callable[[Rows, float], Array], *needs: str, also: Sequence[str] = ()) -> Cause:

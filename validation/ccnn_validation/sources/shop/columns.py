@@ -33,6 +33,6 @@ def file_columns(machine: Machine, rows: Rows, pose: Pose, turn: Rotation, full:
         if of == "speed":
             unit = f"{machine.joint_units[int(name.removeprefix(of)) - 1]}/s"
         else:
-            unit = {"time": "s", "temperature": "degC", "direction": "1"}.get(of, "N")
+            unit = {"time": "s", "temperature": "degC", "direction": "1"}.get(of.split("_")[0], "N")
         columns[f"{name}[{unit}]"] = load[:, "xyz".index(name[-1])] if of.startswith("load") else values
     return {name: np.char.mod("%.10g", values).astype(float) for name, values in columns.items()}
