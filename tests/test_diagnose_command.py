@@ -69,7 +69,8 @@ def test_a_config_beside_its_records_gives_verdict_and_report(
         "q1",
         "q2",
     }
-    assert set(results["not_seen"]) == {"bending", "latency", "sag", "tool"} and "needs a platform that turns" in shown
+    assert set(results["not_seen"]) == {"bending", "error_motion", "latency", "sag", "tool"}
+    assert "needs a platform that turns" in shown
     # The verdict comes before all that takes longer.
     assert shown.index("acklash") < shown.index("How large is the gap?") and shown.count("would remove") == 1
     for name in ("report.html", "diagnosis.md", "diagnosis.safetensors", "next_measurements.csv"):

@@ -34,10 +34,11 @@ _WORDS = {
         "Mounting and lengths of {where}, of sliding axes their squareness, where a value is off by more than its "
         "tolerance.",
     ),
-    f"{PARAMETER}straightness": Words(
-        "guides that are not straight",
-        "guide that is not straight",
-        "Straightness is the bow of a guide over its travel: E, the direction of the bow, the axis that moves.",
+    "error_motion": Words(
+        "guides that are bent or twisted",
+        "error motion of the guide",
+        "Shift along x, y, z and turn about x, y, z of what the joint carries, by Legendre's polynomial of that degree "
+        "from one end of its travel (-1) to the other (1).",
         "Guides of {where}: their alignment, their bed, and the load on them.",
     ),
     "joint_offset": Words(

@@ -18,8 +18,9 @@ ROOT = Path(__file__).parents[2]
 ARM = Path(__file__).parent / "arm.yaml"
 # Iterative forward kinematics are slow; what is told by five_bar and arm is not asked of all of them again.
 ON = {
-    "five_bar": [name for name in EFFECTS if name not in ("tool", "flexure", "bending")],
-    "arm": [name for name in EFFECTS if name != "flexure"],
+    "five_bar": [name for name in EFFECTS if name not in ("tool", "flexure", "bending", "error_motion")],
+    "arm": [name for name in EFFECTS if name not in ("flexure", "error_motion")],
+    "gantry": ["error_motion"],
     "mount": ["geometry", "joint_offset", "drift", "flexure"],
     "stewart": ["geometry", "compliance", "thermal", "gravity", "frame", "instrument"],
     "tripod": ["geometry", "thermal", "tool", "instrument"],
@@ -30,7 +31,7 @@ def make(name: str) -> Mechanism:
     if name == "mount":
         links = [[0.0, torch.pi / 2, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]
         return SerialArm("mount", "standard", links, tool_offset=[0.0, 0.0, 0.0], orientation="direction")
-    return load_mechanism(str(ARM) if name == "arm" else name)
+    return load_mechanism(str(ARM.with_name(f"{name}.yaml")) if name in ("arm", "gantry") else name)
 
 
 @pytest.mark.parametrize(("mechanism", "effect"), [(m, e) for m, effects in ON.items() for e in effects])
@@ -56,6 +57,7 @@ def test_the_library_has_its_order_and_a_line_for_people() -> None:
             "frame",
             "tool",
             "coupling",
+            "error_motion",
             "latency",
             "frame_drift",
         ),

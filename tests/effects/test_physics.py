@@ -53,6 +53,7 @@ def columns(effect: Effect, rows: Situation, shape: Tensor) -> dict[str, Tensor]
     return dict(zip(names, signature(rows, effect, shape).unbind(-1), strict=True))
 
 
+GANTRY = Path(__file__).parent / "gantry.yaml"
 NO_SHAPE = torch.zeros(0, dtype=torch.float64)
 
 
@@ -360,6 +361,21 @@ def test_a_clamped_beam_gives_as_the_textbook_says_at_its_end_and_what_it_carrie
     sink = load * long**3 / 3 + load * beyond * long**2 / 2 + turn * beyond
     wanted = torch.tensor([0, 0, sink, 0, -turn, 0], dtype=torch.float64)
     assert torch.allclose(found, wanted[: len(found)], atol=1e-9)
+
+
+def test_a_guide_shifts_and_turns_all_that_it_carries_about_where_its_carriage_is() -> None:
+    machine = load_mechanism(str(GANTRY))
+    joints = torch.tensor([[0.25, 0.6, 0.1]], dtype=torch.float64)
+    found = columns(make_effect("error_motion"), Situation(machine, joints, {}, default_gravity(machine)), NO_SHAPE)
+    assert len(found) == 3 * 21 and "q1 x 1" not in found
+    # Of x at a quarter of a metre u = -0.5: P1 = -0.5, P2 = -0.125, P3 = 0.4375.
+    assert torch.allclose(found["q1 y 2"][0, :3], -0.125 * torch.eye(3).double()[1])
+    lever = torch.tensor([0.0, 0.6, 0.1], dtype=torch.float64)
+    for name, form in (("q1 rx 1", -0.5), ("q1 rx 3", 0.4375)):
+        turned = torch.linalg.cross(torch.eye(3).double()[0], lever)
+        assert torch.allclose(found[name][0, :3], form * turned)
+    # z carries the tool alone, which is at its carriage.
+    assert not found["q3 rx 1"][:, :3].any()
 
 
 def test_lengths_grow_with_each_further_thermometer_by_what_it_shows_beyond_the_first() -> None:

@@ -24,7 +24,6 @@ from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.files.yaml_file import parse_yaml
-from ccnn_torch.mechanisms.machines.drives import BOW
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.spelling import nearest
@@ -106,8 +105,6 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         (number,) = _numbers(key, entry, given, unit, 1, where)
         numbers.append(_told(entry, key, number, entry.get("same_as", "")) | {"name": key, "unit": unit})
         numbers[-1] |= {"nominal": number.value, "of": dict(entry["of"])}
-        # What is judged by itself, and not with the geometry.
-        numbers[-1] |= {"cause": entry["cause"]} if "cause" in entry else {}
     frames = {
         key: _frame(content.get(f"{key}_frame", about[f"{key}_frame"]), f"{where}: {key}_frame")
         for key in ("base", "tool")
@@ -133,17 +130,10 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         orientation=content.get("orientation", about.get("orientation", "rotation_vector")),
         frame_per=_words(content, "frame_per", where),
         tool_per=_words(content, "tool_per", where),
-        drives=[drive for e in about["numbers"].values() for d in e["of"] for drive in _drives(d)],
+        drives=[(int(d[5]), int(d[6])) for e in about["numbers"].values() for d in e["of"] if d.startswith("drive")],
         numbers=numbers,
         tables=_tables(content, joints, moves, where),
     )
-
-
-def _drives(name: str) -> list[tuple[int, ...]]:
-    """The drive of a parameter `driveij` or `bowij`; none of another one."""
-    if name.startswith("drive"):
-        return [(int(name[5]), int(name[6]))]
-    return [(int(name[3]), int(name[4]), BOW)] if name.startswith("bow") else []
 
 
 def _tables(
@@ -239,8 +229,7 @@ def _numbers(
     texts = texts if isinstance(texts, list) else [texts] * count
     if len(texts) != count:
         raise InputError(f"{where}: numbers.{key}: needs one value, or a list of {count}, not {len(texts)}")
-    # Of a number that a file need not have nothing is searched where it has none.
-    usual = 0 if entry.get("optional") and key not in given else entry.get("tolerance", 0)
+    usual = entry.get("tolerance", 0)
     usual = usual if isinstance(usual, list) else [usual] * count
     found = []
     for text, own in zip(texts, usual, strict=True):

@@ -1,4 +1,4 @@
-"""What drives do to the joints beside what was commanded: leads, couplings, straightness, tables of pitch errors."""
+"""What drives do to the joints beside what was commanded: leads, couplings, tables of pitch errors."""
 
 from __future__ import annotations
 
@@ -9,36 +9,24 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 
-BOW = 2
-"""Third number of a drive whose joint is moved by a parabola over the other one's travel."""
-
 
 class Drives:
-    """Joints as the drives move them: q + Σ c_k φ_k(q_j) e_i + t(q).
+    """Joints as the drives move them: q + Σ c_ij q_j e_i + t(q).
 
-    Of a drive (i, j) φ is q_j. Of (i, j, 2) it is 1 - u², u from -1 to 1 over the travel of joint j: 0 at both ends and
-    1 in the middle, so that it has no slope in common with a squareness. A table t has a joint's error where it was
-    measured, positive where the joint goes too far, linear between, and the last value beyond.
+    A table t has a joint's error where it was measured, positive where the joint goes too far, linear between, and the
+    last value beyond.
     """
 
-    def __init__(
-        self,
-        drives: Sequence[Sequence[int]],
-        limits: Sequence[Sequence[float]],
-        tables: Sequence[Sequence[Sequence[float]] | None],
-    ) -> None:
-        """Take joints i, j from 1, lowest and highest of each joint `n` [SI], and of each the table [SI] or None.
+    def __init__(self, drives: Sequence[Sequence[int]], tables: Sequence[Sequence[Sequence[float]] | None]) -> None:
+        """Take joints i, j from 1 of each drive, and of each of `n` joints the table [SI] or None.
 
         Raises:
             InputError: a table without two places in ascending order, or with another number of errors.
         """
-        n = len(limits)
-        eye, ends = torch.eye(n, dtype=torch.float64), torch.tensor(limits, dtype=torch.float64)
-        which = torch.tensor([[i - 1, j - 1] for i, j, *_ in drives], dtype=torch.int64).reshape(-1, 2)
+        n = len(tables)
+        eye = torch.eye(n, dtype=torch.float64)
+        which = torch.tensor([[i - 1, j - 1] for i, j in drives], dtype=torch.int64).reshape(-1, 2)
         self._to, self._by = eye[which[:, 0]], eye[which[:, 1]]
-        self._bows = torch.tensor([len(d) > BOW for d in drives], dtype=torch.bool)
-        middle, half = ends.mean(-1)[which[:, 1]], (ends[:, 1] - ends[:, 0])[which[:, 1]] / 2
-        self._middle, self._half = middle, half
         first, parts = torch.zeros(n, dtype=torch.float64), []
         for i, table in enumerate(tables):
             if table is None:
@@ -54,18 +42,15 @@ class Drives:
         self._joint = eye[[p[0] for p in parts]]
         self._place, self._width, self._slope = (torch.tensor([p[k] for p in parts]).double() for k in (1, 2, 3))
         self.count = len(drives)
-        self.curved = bool(self._bows.any()) or bool(parts)
+        self.curved = bool(parts)
 
-    def shapes(self, joints: Tensor) -> tuple[Tensor, Tensor]:
-        """φ and its derivative by q_j of every drive at joints `... x n`, `... x d` each."""
-        q = joints @ self._by.mT
-        u = (q - self._middle) / self._half
-        bow, slope = 1 - u * u, -2 * u / self._half
-        return torch.where(self._bows, bow, q), torch.where(self._bows, slope, torch.ones_like(q))
+    def of(self, joints: Tensor) -> Tensor:
+        """q_j of every drive at joints `... x n`, `... x d`."""
+        return joints @ self._by.mT
 
     def moved(self, joints: Tensor, own: Tensor) -> Tensor:
         """The joints as driven, `... x n`; own: c, `... x d`."""
-        moved: Tensor = joints + (own * self.shapes(joints)[0]) @ self._to
+        moved: Tensor = joints + (own * self.of(joints)) @ self._to
         if not len(self._joint):
             return moved
         along = torch.minimum((joints @ self._joint.mT - self._place).clamp_min(0.0), self._width)
@@ -73,10 +58,9 @@ class Drives:
 
     def coupled(self, joints: Tensor | None, own: Tensor) -> Tensor:
         """How joints move for each unit of the commands, `... x n x n`; joints may be None where nothing is curved."""
-        slope = own if joints is None else own * self.shapes(joints)[1]
         n = self._first.shape[0]
         spread = (self._to[:, :, None] * self._by[:, None, :]).flatten(1)
-        matrix = (slope @ spread).reshape(*slope.shape[:-1], n, n) + torch.eye(n, dtype=own.dtype)
+        matrix = (own @ spread).reshape(*own.shape[:-1], n, n) + torch.eye(n, dtype=own.dtype)
         if joints is None or not len(self._joint):
             return matrix
         along = joints @ self._joint.mT - self._place

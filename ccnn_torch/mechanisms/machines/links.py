@@ -13,8 +13,6 @@ from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, rotation_vector_t
 
 # Plausible share by which a drive moves another joint, or its own too far: that of a gear or a scale.
 _DRIVE = 1e-3
-# And by which an axis bows over its travel [m], [rad].
-_BOW = 2e-5
 LinkTransform = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
@@ -120,11 +118,8 @@ def links_and_drives(
         found += [
             Parameter(f"{p}{i + 1}", u, v, sense=zero.get(p, "")) for p, u, v in zip(names, units, row, strict=True)
         ]
-    for i, j, *bow in drives:
+    for i, j in drives:
         to, by = joint_units[i - 1], joint_units[j - 1]
-        if bow:
-            found.append(Parameter(f"bow{i}{j}", to, 0.0, scale=_BOW))
-            continue
         found.append(Parameter(f"drive{i}{j}", "1" if to == by else f"{to}/{by}", 0.0, scale=_DRIVE))
     return found
 

@@ -74,8 +74,7 @@ class SerialArm(Mechanism):
             which the tool looks, so that only lengths behind the last axis count, and a shift of the base does nothing.
         rotation_weight: [m/rad].
         drives: pairs of joints i, j (from 1): the drive of joint j moves joint i as well, by parameter driveij for each
-            unit; of i = j joint i is off by that share (lead, gear ratio). With a third number 2 it moves it by bowij
-            times a parabola over its travel (straightness).
+            unit; of i = j joint i is off by that share (lead, gear ratio).
         own_drives: what these and the tables of pitch errors do.
     """
 
@@ -183,7 +182,7 @@ class SerialArm(Mechanism):
         self.register_buffer("signs", torch.tensor(joint_sign or [1.0] * n, dtype=torch.float64))
         self.register_buffer("revolute", torch.tensor(turn))
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
-        self.own_drives = Drives(drives, span, tables or [None] * n)
+        self.own_drives = Drives(drives, tables or [None] * n)
         self.drives, self._named, self._links_size = tuple(map(tuple, drives)), bool(numbers), count - len(drives)
         self.register_buffer("_start", start, persistent=False)
         self.register_buffer("_shares", shares, persistent=False)
@@ -392,8 +391,8 @@ class SerialArm(Mechanism):
         """Columns of the parameters between the frames, `... x k x 3`, from those of the links `... x l x 3` and of the
         joints as driven `... x n x 3`."""
         if self.drives:
-            shape = self.own_drives.shapes(joints)[0]
-            more = [rates[..., i - 1, :] * shape[..., k, None] for k, (i, *_) in enumerate(self.drives)]
+            by = self.own_drives.of(joints)
+            more = [rates[..., i - 1, :] * by[..., k, None] for k, (i, _) in enumerate(self.drives)]
             columns = torch.cat([columns, torch.stack(more, -2).expand(*columns.shape[:-2], -1, 3)], -2)
         return self._shares @ columns if self._named else columns
 
