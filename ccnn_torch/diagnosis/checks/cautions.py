@@ -42,7 +42,7 @@ _SEVERAL, _DRAWS, _BY_CHANCE = 5, 1000, 0.003
 # A joint that moves less than this share of its workspace is at rest.
 _STILL = 1e-3
 # Effects that only the place of a row distinguishes.
-_OF_PLACE = EXACT | {"coupling", "gravity", "transmission"}
+_OF_PLACE = EXACT | {"coupling", "error_motion", "gravity", "transmission"}
 # Periods from which an error is seen to repeat.
 _PERIODS = 1.5
 # Standard deviations from which a coefficient has a sign.
