@@ -328,8 +328,8 @@ def moments(records: Records) -> Tensor:
 # Rows that the search uses: more take longer and show the same.
 _MOST_ROWS = 1000
 _EFFECTS = (
-    *("joint_gain", "transmission", "backlash", "friction", "compliance", "sag", "gravity", "thermal"),
-    *("coupling", "error_motion", "flexure"),
+    *("joint_gain", "transmission", "backlash", "friction", "compliance", "thermal_compliance", "sag", "gravity"),
+    *("bending", "thermal", "coupling", "error_motion", "flexure"),
 )
 """What is looked for where nothing is asked: all of the library that acts within the machine and that a command can
 know. Frames and geometry are fitted beside, and a drift of the measuring frame where the rows have times; an error of
