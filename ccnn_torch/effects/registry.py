@@ -332,6 +332,7 @@ def is_number(value: object) -> bool:
 
 
 EFFECTS: dict[str, Callable[[], Effect]] = {
+    "tool": Tool,
     "geometry": Geometry,
     "joint_offset": JointOffset,
     "joint_gain": JointGain,
@@ -347,7 +348,6 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "drift": Drift,
     "homing": Homing,
     "frame": Frame,
-    "tool": Tool,
     "coupling": Coupling,
     "error_motion": ErrorMotion,
     "latency": Latency,

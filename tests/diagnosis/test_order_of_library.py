@@ -23,16 +23,16 @@ def told(columns: list[list[float]], sets: list[tuple[str, ...]], names: list[st
     return tuple(sorted(chosen.names))
 
 
-NAMES = ["geometry", "tool", "gravity"]
+NAMES = ["geometry", "instrument", "gravity"]
 ONE, OTHER, BOTH = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]
 
 
 def test_of_names_that_do_the_same_the_first_of_the_library_is_told() -> None:
-    assert told([ONE, ONE, OTHER], [("tool",), ("geometry",)], NAMES) == ("geometry",)
-    assert told([ONE, OTHER, OTHER], [("tool",), ("geometry",)], NAMES) == ("tool",)
+    assert told([ONE, ONE, OTHER], [("instrument",), ("geometry",)], NAMES) == ("geometry",)
+    assert told([ONE, OTHER, OTHER], [("instrument",), ("geometry",)], NAMES) == ("instrument",)
 
 
 def test_a_redundant_set_stays_where_no_smaller_one_was_found() -> None:
     # Gravity can do what the other two do together; the only other set is as large.
-    sets = [("geometry", "tool", "gravity"), ("geometry", "joint_offset", "gravity")]
-    assert told([ONE, OTHER, BOTH, OTHER], sets, [*NAMES, "joint_offset"]) == ("geometry", "gravity", "tool")
+    sets = [("geometry", "instrument", "gravity"), ("geometry", "joint_offset", "gravity")]
+    assert told([ONE, OTHER, BOTH, OTHER], sets, [*NAMES, "joint_offset"]) == ("geometry", "gravity", "instrument")

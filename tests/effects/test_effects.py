@@ -45,7 +45,7 @@ def test_the_example_of_an_own_effect_keeps_it_too() -> None:
 
 def test_the_library_has_its_order_and_a_line_for_people() -> None:
     assert list(EFFECTS) == [
-        *("geometry", "joint_offset", "joint_gain", "transmission", "backlash", "friction", "compliance"),
+        *("tool", "geometry", "joint_offset", "joint_gain", "transmission", "backlash", "friction", "compliance"),
         *(
             "thermal_compliance",
             "sag",
@@ -55,7 +55,6 @@ def test_the_library_has_its_order_and_a_line_for_people() -> None:
             "drift",
             "homing",
             "frame",
-            "tool",
             "coupling",
             "error_motion",
             "latency",
