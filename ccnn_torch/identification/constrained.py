@@ -35,6 +35,7 @@ from ccnn_torch.identification.judge import drawn_sizes, scatter
 from ccnn_torch.identification.measured import Kinematics, Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.poses import forward_problem
+from ccnn_torch.identification.problems.problem import check_equations
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
 from ccnn_torch.mechanisms import Instrument, Mechanism, PoseError
@@ -144,7 +145,7 @@ def fit_constraint(
     of_machine = [n for group in free.groups for n in group]
     tool = [] if isinstance(mechanism, Instrument) else [n for n in of_machine if n.startswith("tool_")]
     choice = ParameterChoice(of_machine, (), about.tied, {**_priors(config, mechanism, of_machine), **about.prior})
-    rows = placed(rows, mechanism)
+    rows = placed(rows, mechanism, exactly=not tool)
     before = _tool_first(rows, len(names), tool, choice)
     if tool:
         rows = placed(rows, mechanism.with_nominal(before.whole[: len(names)]))
@@ -264,8 +265,9 @@ def _problem(
     choice = replace(choice, free=[*(choice.free or ()), *names], prior=prior)
     # Held-out rows are in units of the noise, too.
     problem = forward_problem(seen, rows.joints, rows.said, None, choice, sizes, start=seen.nominal)
-    selection = select_parameters(seen.geometry, choice, seen.nominal)
-    return replace(problem, weights=rows.weights[None]), selection
+    problem = replace(problem, weights=rows.weights[None])
+    check_equations(problem)
+    return problem, select_parameters(seen.geometry, choice, seen.nominal)
 
 
 def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> dict[str, float]:
@@ -388,6 +390,9 @@ def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
     return [f"No better known than by the tolerance given: {', '.join(prior)}."] if prior else []
 
 
+_BESIDE = ("rows", "unit", "noise", "before", "after")
+
+
 def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit) -> dict[str, Any]:
     """What was found of the constraint itself."""
     assert config.constraint is not None
@@ -406,5 +411,9 @@ def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit
         "unit": rows.unit,
         "noise": fit.noise.of(rows.read[0][0]),
         "noise_known": config.noise is not None,
+        "beside": [
+            {"kind": one.kind, "records": str(one.records), **{key: fit.readings[read[0]][key] for key in _BESIDE}}
+            for one, read in zip(config.constraint.beside, rows.read[1:], strict=True)
+        ],
         "readings": fit.readings,
     }

@@ -21,6 +21,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import BesideConfig, ConstraintConfig, IdentifyConfig
 from ccnn_torch.identification.measured import nominal_machine, notes_of, split_records
 from ccnn_torch.identification.problems.sockets import Sockets
+from ccnn_torch.identification.problems.whitened import check_finite
 from ccnn_torch.mechanisms import Framed, Instrument, Mechanism, Partial, SerialArm, as_measured, fit_unknown
 from ccnn_torch.mechanisms.frames.instrument import make_part
 from ccnn_torch.mechanisms.frames.part import Part, tool_points
@@ -105,8 +106,8 @@ def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given |
         if other.kind == "pose":
             others.append(_poses(config, other.records, mechanism, other)[0])
         else:
-            source = read_source(other.records, config.columns)
-            table = read_joints(source, mechanism, config.joint_map, config.columns)
+            read = read_source(other.records, config.columns)
+            table = read_joints(read, mechanism, config.joint_map, config.columns)
             others.append(_rows_of(table, mechanism, other, torch.arange(len(table))))
     rows = _together(rows, others, mechanism)
     if not isinstance(mechanism, Instrument) or not isinstance(rows.seen, Instrument):
@@ -159,6 +160,10 @@ def _parts(seen: Mechanism, mechanism: Mechanism) -> list[Part]:
 def _rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> ConstraintRows:
     """The rows of a table that are numbered, all of weight 1, and the instrument that reads them."""
     joints = torch.from_numpy(stack_columns(table, mechanism.joints, _ANGLE_LIMIT))[there]
+    at = tool_points(mechanism, joints)
+    weights = torch.ones(len(joints), dtype=torch.float64)
+    name = f"mechanism '{mechanism.name}'"
+    check_finite(at[None], weights[None] > 0, joints[None], mechanism.joints, name, "xyz")
     second = [Coordinate(f"{j.name}{SECOND}", j.unit) for j in mechanism.joints]
     paired = about.kind == "distances" and any(c.name in table for c in second)
     if paired and about.by is not None:
@@ -176,14 +181,14 @@ def _rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> 
     # Of a socket its place is what it is, too.
     of = torch.cat([of, read], -1) if about.kind == "sockets" else of
     held_in = of if about.kind == "sockets" else group[:, None]
-    seen = Instrument(mechanism, Part(_reading(about, mechanism, joints, read, group, paired)))
+    seen = Instrument(mechanism, Part(_reading(about, mechanism, at, read, group, paired)))
     return ConstraintRows(
         joints=joints,
         said=torch.cat([read, of], -1),
         group=group,
         labels=labels,
         cell=torch.unique(held_in, dim=0, return_inverse=True)[1],
-        weights=torch.ones(len(joints), dtype=torch.float64),
+        weights=weights,
         data_hash=table.data_hash,
         seen=seen,
         read=(tuple(c.name for c in seen.pose[: seen.compared]),),
@@ -191,8 +196,8 @@ def _rows_of(table: Table, mechanism: Mechanism, about: Kind, there: Tensor) -> 
     )
 
 
-def _reading(about: Kind, mechanism: Mechanism, joints: Tensor, read: Tensor, group: Tensor, paired: bool) -> Reading:
-    """What reads rows of a kind; joints `s x n`, read `s x c` [SI], group: number of each row's, `s`."""
+def _reading(about: Kind, mechanism: Mechanism, at: Tensor, read: Tensor, group: Tensor, paired: bool) -> Reading:
+    """What reads rows of a kind; at `s x 3`: the tool, read `s x c` [SI], group: number of each row's, `s`."""
     numbers = torch.unique(group).tolist()
     if about.kind == "distances":
         return Between(mechanism) if paired else Wire(numbers)
@@ -204,16 +209,19 @@ def _reading(about: Kind, mechanism: Mechanism, joints: Tensor, read: Tensor, gr
     if given is not None and extent == 0:
         raise InputError("plate_tolerance: a plate with a single socket has no scale; leave it out")
     tolerance = _PLATE_TOLERANCE if given is None else size(given, "m", "constraint.plate_tolerance")
-    return Sockets(group, read, tool_points(mechanism, joints), tolerance / extent if extent > 0 else 0.0)
+    return Sockets(group, read, at, tolerance / extent if extent > 0 else 0.0)
 
 
-def placed(rows: ConstraintRows, mechanism: Mechanism) -> ConstraintRows:
-    """With what reads the rows that have weight where it suits a machine; a machine with instruments has them."""
+def placed(rows: ConstraintRows, mechanism: Mechanism, exactly: bool = False) -> ConstraintRows:
+    """With what reads the rows that have weight where it suits a machine; a machine with instruments has them.
+
+    exactly: by least squares, not by closed forms alone.
+    """
     if not isinstance(rows.seen, Instrument) or isinstance(mechanism, Instrument):
         return rows
-    used = rows.weights > 0
-    about = rows.joints[used], rows.said[used]
-    return replace(rows, seen=rows.seen.around(mechanism).suited(*about).placed(*about))
+    about = rows.joints[rows.weights > 0], rows.said[rows.weights > 0]
+    seen = rows.seen.around(mechanism).suited(*about)
+    return replace(rows, seen=seen.placed(*about) if exactly else seen)
 
 
 def _taking_part(table: Table, where: Mapping[str, float]) -> Tensor:

@@ -309,13 +309,15 @@ class Instrument(Seen):
         return torch.stack(flat).reshape(*weights.shape[:-1], -1)
 
     def suited(self, joints: Tensor, pose: Tensor) -> Instrument:
-        """Itself with parameters of the instruments counted from where rows show them; nothing is fitted."""
-        parts, values = list[Part](), self.mechanism.nominal
+        """Itself where closed forms put the instruments by rows, their parameters counted from where rows show them."""
+        parts, machine = list[Part](), self.mechanism.nominal
+        values = [machine]
         for part, q, rows, given in self._shown(joints, pose):
-            place = place_with(self.mechanism, part, q, values, given)
+            place = place_with(self.mechanism, part, q, machine, given)
             parts.append(replace(part, reading=part.reading.suited(place, rows)))
-        found = Instrument(self.mechanism, *parts)
-        return found.with_nominal(torch.cat([values, found.nominal[len(values) :]]))  # type: ignore[return-value]
+            own = torch.tensor([p.nominal for p in parts[-1].parameters], dtype=torch.float64)
+            values.append(parts[-1].start(place, rows, own))
+        return Instrument(self.mechanism, *parts).with_nominal(torch.cat(values))  # type: ignore[return-value]
 
     def placed(self, joints: Tensor, pose: Tensor) -> Instrument:
         """Itself where the instruments stand as suits rows best, the machine, its frames and a lens as they are."""
