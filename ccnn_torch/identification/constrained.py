@@ -39,8 +39,8 @@ from ccnn_torch.identification.problems.problem import check_equations
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
 from ccnn_torch.mechanisms import Instrument, Mechanism, PoseError
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.mechanisms.frames.part import tool_points
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.verification.promise import configurations, promise_block
 
 # Links and noise are estimated in turn, the noise from this size on [m].
@@ -54,36 +54,24 @@ Sizes = float | dict[str, float]
 
 
 @dataclass(frozen=True)
-class State:
-    """Parameters of the machine and of what reads it `K` [SI], with the problem and values `1 x p` [SI] they are of.
-
-    noise: of each of the problem's channels, `c` [SI]; 1 if unknown.
-    """
-
-    whole: Tensor
-    problem: Problem
-    values: Tensor
-    noise: Tensor
-
-
-@dataclass(frozen=True)
 class ConstraintFit:
     """What was found.
 
     Attributes:
-        before: links nominal, the tool's offset fitted.
+        before: the machine and what reads it, links nominal, the tool's offset fitted.
         after: all fitted.
         selection: the machine's free parameters, which are the first of the problem's.
         knowledge: of all the problem's parameters.
-        fit: the last round's.
+        problem, fit: the last round's.
         noise: of the readings.
         readings: of each reading where they have noise of their own, by name.
     """
 
-    before: State
-    after: State
+    before: Mechanism
+    after: Mechanism
     selection: Selection
     knowledge: Knowledge
+    problem: Problem
     fit: Fit
     noise: _Noise
     readings: dict[str, dict[str, Any]]
@@ -122,7 +110,7 @@ class _Noise:
         names = [channel.name for channel in problem.channels]
         group = torch.tensor([self.group[name] for name in names])
         inside = torch.nn.functional.one_hot(group, len(self.size)).double()
-        square, used = _residual(problem, values)[0].square(), problem.weights[0] > 0
+        square, used = problem.residual(values[:, None], *problem.data)[0].detach().square(), problem.weights[0] > 0
         square, count = (each[used].double().sum(0) @ inside for each in (square, rows.measured(names)))
         return (self.size * (square / count.clamp_min(1)).sqrt()).clamp_min(_LEAST_NOISE)
 
@@ -146,27 +134,30 @@ def fit_constraint(
     tool = [] if isinstance(mechanism, Instrument) else [n for n in of_machine if n.startswith("tool_")]
     choice = ParameterChoice(of_machine, (), about.tied, {**_priors(config, mechanism, of_machine), **about.prior})
     rows = placed(rows, mechanism, exactly=not tool)
-    before = _tool_first(rows, len(names), tool, choice)
+    before, count = rows.seen, len(names)
     if tool:
-        rows = placed(rows, mechanism.with_nominal(before.whole[: len(names)]))
+        problem, whole = _problem(rows, count, ParameterChoice(free=tool), None)
+        before = before.with_nominal(whole.full(solve_lm(problem).values)[0])
+        rows = placed(rows, mechanism.with_nominal(before.nominal[:count]))
     solver, noise = solver_of("lm", config), _noise(config, rows)
     rounds = 1 if bool(noise.known.all()) else _ROUNDS
-    selection = select_parameters(mechanism.geometry, choice, before.whole[: len(names)])
+    selection = select_parameters(mechanism.geometry, choice, before.nominal[:count])
     loss = config.robust or "squared"
     for done in range(rounds):
-        problem, whole = _problem(rows, len(names), choice, noise.sizes)
+        problem, whole = _problem(rows, count, choice, noise.sizes)
         fit = solver(problem, config.seed)
         noise = noise.grown(noise.left(rows, problem, fit.values))
         if progress is not None:
             progress((done + 1) / rounds)
     if rounds > 1:
-        problem = _problem(rows, len(names), choice, noise.sizes)[0]
+        problem = _problem(rows, count, choice, noise.sizes)[0]
         spared = float(what_is_known(reweighted(problem, fit.values, loss), fit.values).noise)
         noise = noise.grown(noise.size * (max(1.0, spared) if spared < float("inf") else 1.0))
-        problem = _problem(rows, len(names), choice, noise.sizes)[0]
-    after = State(whole.full(fit.values)[0], problem, fit.values, _sizes(rows, problem, noise.sizes))
+        problem = _problem(rows, count, choice, noise.sizes)[0]
+    after = rows.seen.with_nominal(whole.full(fit.values)[0])
     known = what_is_known(reweighted(problem, fit.values, loss), fit.values)
-    return ConstraintFit(before, after, selection, known, fit, noise, _readings(noise, rows, problem, fit.values))
+    read = _readings(noise, rows, problem, fit.values)
+    return ConstraintFit(before, after, selection, known, problem, fit, noise, read)
 
 
 def _noise(config: IdentifyConfig, rows: ConstraintRows) -> _Noise:
@@ -221,25 +212,18 @@ def _readings(noise: _Noise, rows: ConstraintRows, problem: Problem, values: Ten
     }
 
 
-def _held_error(mechanism: Mechanism, rows: ConstraintRows, state: State, held: Tensor, sockets: bool) -> PoseError:
+def _held_error(rows: ConstraintRows, seen: Mechanism, held: Tensor, sockets: bool) -> PoseError:
     """How far the tool of the held-out rows is from where the constraint holds it, `1 x t`; NaN of what was not read.
 
     In a socket: from the mean of the points that the rows with weight put into the same socket of the same placement,
-    which needs no fitted plate. Else |residual| of what was read, of lengths and of angles.
+    which needs no fitted plate. Else the difference of what was read, of lengths and of angles.
     """
     if sockets:
-        far = scatter(
-            tool_points(mechanism, rows.joints, state.whole[: len(mechanism.geometry)]), rows.cell, rows.weights
-        )
-        return PoseError(far[None, held], None)
-    names, left = [c.name for c in state.problem.channels], _residual(state.problem, state.values)[0] * state.noise
-    units, seen = {c.name: c.unit for c in rows.seen.pose if c.name in rows.read[0]}, rows.measured(names)
-    parts = []
-    for unit in ("m", "rad"):
-        mine = [k for k, name in enumerate(names) if units.get(name) == unit]
-        far = left[:, mine].norm(dim=-1)
-        parts.append((torch.where(seen[:, mine].any(-1), far, math.nan) if mine else far)[None, held])
-    return PoseError(parts[0], parts[1] if "rad" in units.values() else None)
+        assert isinstance(seen, Instrument)
+        points = tool_points(seen.mechanism, rows.joints)
+        return PoseError(scatter(points, rows.cell, rows.weights)[None, held], None)
+    joints, said = rows.joints[None, held], rows.said[None, held]
+    return seen.pose_error(seen.forward_kinematics(joints, guess=completed(seen, joints, said)), said)
 
 
 def _problem(
@@ -286,32 +270,6 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
     return priors | {n: _TOOL_TOLERANCE for n in free if n.startswith("tool_") and "tool" not in unknown}
 
 
-def _tool_first(rows: ConstraintRows, machine: int, tool: list[str], choice: ParameterChoice) -> State:
-    """The tool's offset and what is unknown of instruments, links nominal; where the tool is fixed, as they are."""
-    if not tool:
-        problem, _ = _problem(rows, machine, choice, _FIRST_NOISE)
-        return State(rows.seen.nominal, problem, problem.start, _sizes(rows, problem, _FIRST_NOISE))
-    problem, selection = _problem(rows, machine, ParameterChoice(free=tool), None)
-    values = solve_lm(problem).values
-    return State(selection.full(values)[0], problem, values, _sizes(rows, problem, None))
-
-
-def _sizes(rows: ConstraintRows, problem: Problem, noise: Sizes | None) -> Tensor:
-    """What the problem's channels `c` are divided by [SI]."""
-    seen, names = rows.seen, [channel.name for channel in problem.channels]
-    if isinstance(noise, dict):
-        return torch.tensor([noise[name] for name in names], dtype=torch.float64)
-    plain = torch.tensor([1 / ROTATION_WEIGHT if c.unit == "rad" else 1.0 for c in seen.pose], dtype=torch.float64)
-    sizes = plain if noise is None else sizes_of_pose(noise, seen.pose, "noise")
-    every = [c.name for c in seen.pose]
-    return sizes[[every.index(name) for name in names]]
-
-
-def _residual(problem: Problem, values: Tensor) -> Tensor:
-    """`1 x s x c`, of all rows."""
-    return problem.residual(values[:, None], *problem.data).detach()
-
-
 # An interval above this share of its prior's is the prior's. Turning machine and plates together turns the residuals,
 # too, which the linearised problem takes for a little knowledge.
 _AS_PRIOR = 0.9
@@ -333,17 +291,17 @@ def identify_by_constraint(
     begun = time.perf_counter()
     fit = fit_constraint(config, mechanism, rows, progress)
     held, sockets = rows.weights == 0, config.constraint is not None and config.constraint.kind == "sockets"
-    before, after = (_held_error(mechanism, rows, s, held, sockets) for s in (fit.before, fit.after))
+    before, after = (_held_error(rows, seen, held, sockets) for seen in (fit.before, fit.after))
     count = len(mechanism.geometry)
     sizes = before.position[0], after.position[0]
-    picture = drawn_sizes(mechanism, rows.joints[held], *sizes, fit.after.whole[:count])
+    picture = drawn_sizes(mechanism, rows.joints[held], *sizes, fit.after.nominal[:count])
     if config.fits_again() and bool(held.any()):
         every = replace(rows, weights=torch.ones_like(rows.weights))
         again = fit_constraint(config, mechanism, every)
         fit = again if bool(again.fit.converged.all()) else fit
     outcome = Outcome(
         machines=torch.arange(1),
-        values=fit.after.whole[None, :count],
+        values=fit.after.nominal[None, :count],
         converged=fit.fit.converged,
         evaluations=fit.fit.evaluations,
         seconds=time.perf_counter() - begun,
@@ -356,7 +314,7 @@ def identify_by_constraint(
         view=mechanism,
         rows=Rows(rows.joints[None, ~held], rows.said[None, ~held]),
         test=Rows(rows.joints[None, held], rows.said[None, held]),
-        start=fit.before.whole[None, :count],
+        start=fit.before.nominal[None, :count],
         data_hash=rows.data_hash,
         notes=notes,
     )
@@ -374,13 +332,8 @@ def identify_by_constraint(
 def _known(fit: ConstraintFit) -> Known:
     """The machine's part of what is known; a parameter that only its prior determines has no interval."""
     knowledge = fit.knowledge
-    prior = fit.after.problem.prior_sd
-    prior = torch.nn.functional.pad(prior, (0, knowledge.sd.shape[-1] - len(prior)), value=math.inf)
-    determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * prior)
-    noise = knowledge.noise if fit.after.problem.noise_known else torch.ones(1, dtype=torch.float64)
-    return known_of(
-        [replace(knowledge, sd=torch.where(determined, knowledge.sd, math.inf), noise=noise)], fit.selection
-    )
+    determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * fit.problem.prior_sd)
+    return known_of([replace(knowledge, sd=torch.where(determined, knowledge.sd, math.inf))], fit.selection)
 
 
 def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
@@ -396,7 +349,7 @@ _BESIDE = ("rows", "unit", "noise", "before", "after")
 def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit) -> dict[str, Any]:
     """What was found of the constraint itself."""
     assert config.constraint is not None
-    every = zip(fit.after.problem.parameters, fit.after.values[0].tolist(), fit.knowledge.sd[0].tolist(), strict=False)
+    every = zip(fit.problem.parameters, fit.fit.values[0].tolist(), fit.knowledge.sd[0].tolist(), strict=False)
     unknowns = {
         parameter.name: {"value": value, "sd": sd if math.isfinite(sd) else None, "unit": parameter.unit}
         for parameter, value, sd in [*every][len(fit.selection.parameters) :]
