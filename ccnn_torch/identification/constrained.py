@@ -176,10 +176,8 @@ def _noise(config: IdentifyConfig, rows: ConstraintRows) -> _Noise:
             values[mine] = sizes_by_name(noise, own, key, [math.nan] * len(own))
             # What is given by name is of that alone.
             numbers = [len(every) + k if k in mine and not values[k].isnan() else n for k, n in enumerate(numbers)]
-        elif noise is not None and len({numbers[k] for k in mine}) > 1:
-            values[mine] = sizes_of_pose(noise, own, key)
         elif noise is not None:
-            values[mine] = size(noise, "rad" if all(c.unit == "rad" for c in own) else "m", key)
+            values[mine] = sizes_of_pose(noise, own, key)
         _require_sizes([v for v in values[mine].tolist() if not math.isnan(v)], key, "remove the key")
     groups = sorted({*numbers})
     first = values[[numbers.index(n) for n in groups]]
