@@ -5,11 +5,6 @@ from ccnn_torch.identification.identifiability import (
     require_identifiable as require_identifiable,
     what_is_known as what_is_known,
 )
-from ccnn_torch.identification.problems.constraints import (
-    scatter as scatter,
-    socket_problem as socket_problem,
-    tool_points as tool_points,
-)
 from ccnn_torch.identification.problems.parameters import (
     ParameterChoice as ParameterChoice,
     Selection as Selection,
@@ -34,3 +29,4 @@ from ccnn_torch.identification.solvers.tikhonov import (
     l_curve as l_curve,
     solve_tikhonov as solve_tikhonov,
 )
+from ccnn_torch.mechanisms.frames.part import tool_points as tool_points

@@ -51,7 +51,7 @@ class BesideConfig(Section):
 
 
 class ConstraintConfig(Section):
-    """What holds the tool instead of a measuring device; see `ccnn_torch.identification.problems.constraints`."""
+    """What holds the tool instead of a measuring device; see `docs/how_to/identify.md`."""
 
     kind: Literal["sockets", "distances", "plane", "pose"] = Field(
         default="sockets",

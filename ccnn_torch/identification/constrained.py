@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import torch
@@ -22,57 +21,36 @@ from ccnn_torch.identification import (
     Problem,
     Progress,
     reweighted,
-    scatter,
-    socket_problem,
     solve_lm,
-    tool_points,
     what_is_known,
 )
-from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig
+from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.constrained_rows import (
     ConstraintRows,
-    Kind,
     machine_in_own_base,
     placed,
-    poses_of,
-    read_by,
     read_constraint,
-    rows_of,
 )
-from ccnn_torch.identification.judge import drawn_sizes
+from ccnn_torch.identification.judge import drawn_sizes, scatter
 from ccnn_torch.identification.measured import Kinematics, Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.poses import forward_problem
-from ccnn_torch.identification.problems.problem import joined
+from ccnn_torch.identification.problems.problem import check_equations
 from ccnn_torch.identification.result import Found, Known, assemble, known_of
 from ccnn_torch.identification.solve import Outcome, choice_of, solver_of
 from ccnn_torch.mechanisms import Instrument, Mechanism, PoseError
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
-from ccnn_torch.mechanisms.frames.instrument import instrument
-from ccnn_torch.records.commanded import read_joints
-from ccnn_torch.records.load import read_source
+from ccnn_torch.mechanisms.frames.part import tool_points
+from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.verification.promise import configurations, promise_block
 
 # Links and noise are estimated in turn, the noise from this size on [m].
 _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
-# Prior of the tool's offset around its first fit, and of a plate's extent around what its records say [m].
-_TOOL_TOLERANCE, _PLATE_TOLERANCE = 0.05, 1e-4
+# Prior of the tool's offset around its first fit [m].
+_TOOL_TOLERANCE = 0.05
 _LINK_TOLERANCE = {"m": 1e-3, "rad": 1e-2}
 
-Build = Callable[[ParameterChoice, Tensor, float | Mapping[str, float] | None], Problem]
-
-
-@dataclass(frozen=True)
-class State:
-    """A geometry `K` [SI] with the problem and its values `1 x p` [SI] that it came from.
-
-    noise: of each of the problem's channels, `c` [SI]; 1 if unknown.
-    """
-
-    geometry: Tensor
-    problem: Problem
-    values: Tensor
-    noise: Tensor
+Sizes = float | dict[str, float]
+"""Noise as `forward_problem` takes it [SI]."""
 
 
 @dataclass(frozen=True)
@@ -80,88 +58,72 @@ class ConstraintFit:
     """What was found.
 
     Attributes:
-        before: links nominal, the tool's offset fitted.
+        before: the machine and what reads it, links nominal, the tool's offset fitted.
         after: all fitted.
         selection: the machine's free parameters, which are the first of the problem's.
         knowledge: of all the problem's parameters.
-        fit: the last round's.
-        beside: of rows of other kinds, one each.
+        problem, fit: the last round's.
+        noise: of the readings.
         readings: of each reading where they have noise of their own, by name.
     """
 
-    before: State
-    after: State
+    before: Mechanism
+    after: Mechanism
     selection: Selection
     knowledge: Knowledge
+    problem: Problem
     fit: Fit
-    beside: list[dict[str, Any]]
+    noise: _Noise
     readings: dict[str, dict[str, Any]]
 
 
-@dataclass
-class _Source:
-    """Rows of one kind: what makes their problem, and the noise of an equation, as given or of the last round.
+@dataclass(frozen=True)
+class _Noise:
+    """Noise of what is read, as given or of the last round.
 
     Attributes:
-        noise: of each group of channels that have one, `g` [SI].
+        size: of each group of readings that have one, `g` [SI].
         known: which of these were given, `g` bool.
-        group: of each channel, by its name; {} where all have one.
+        group: of each reading, by its name.
     """
 
-    build: Build
-    rows: ConstraintRows
-    noise: Tensor
+    size: Tensor
     known: Tensor
     group: Mapping[str, int]
 
     @property
-    def sizes(self) -> float | dict[str, float]:
+    def sizes(self) -> Sizes:
         """As `forward_problem` takes them."""
-        values = self.noise.tolist()
-        return {name: values[i] for name, i in self.group.items()} if self.group else float(values[0])
+        values = self.size.tolist()
+        return {name: values[i] for name, i in self.group.items()} if len(values) > 1 else float(values[0])
 
-    def left(self, problem: Problem, values: Tensor) -> Tensor:
+    def of(self, name: str) -> float:
+        """Of a reading [SI]."""
+        return float(self.size[self.group[name]])
+
+    def grown(self, size: Tensor) -> _Noise:
+        """With other sizes `g` [SI] where they were not given."""
+        return replace(self, size=torch.where(self.known, self.size, size))
+
+    def left(self, rows: ConstraintRows, problem: Problem, values: Tensor) -> Tensor:
         """Root mean square of the residuals of the rows with weight, `g` [SI]."""
-        group = torch.tensor([self.group.get(channel.name, 0) for channel in problem.channels])
-        inside = torch.nn.functional.one_hot(group, len(self.noise)).double()
-        square, seen = _residual(problem, values)[0].square(), self.rows.measured([c.name for c in problem.channels])
-        used = problem.weights[0] > 0
-        square, count = (each[used].double().sum(0) @ inside for each in (square, seen))
-        return (self.noise * (square / count.clamp_min(1)).sqrt()).clamp_min(_LEAST_NOISE)
-
-    def told(self, problem: Problem, values: Tensor) -> dict[str, Any]:
-        """How many rows, and of the first group the noise and what is left [SI]."""
-        about = {"rows": len(self.rows.joints), "unit": self.rows.unit}
-        before, after = (float(self.left(problem, at)[0]) for at in (problem.start, values))
-        return about | {"noise": float(self.noise[0]), "before": before, "after": after}
-
-    def sd(self, problem: Problem) -> Tensor:
-        """Noise of each of the problem's channels, `c` [SI]."""
-        seen, sizes = self.rows.seen, self.sizes
-        if seen is None or isinstance(sizes, dict):
-            each = [sizes[c.name] if isinstance(sizes, dict) else sizes for c in problem.channels]
-            return torch.tensor(each, dtype=torch.float64)
-        return _of_channels(problem, seen, sizes_of_pose(sizes, seen.pose, "noise"))
+        names = [channel.name for channel in problem.channels]
+        group = torch.tensor([self.group[name] for name in names])
+        inside = torch.nn.functional.one_hot(group, len(self.size)).double()
+        square, used = problem.residual(values[:, None], *problem.data)[0].detach().square(), problem.weights[0] > 0
+        square, count = (each[used].double().sum(0) @ inside for each in (square, rows.measured(names)))
+        return (self.size * (square / count.clamp_min(1)).sqrt()).clamp_min(_LEAST_NOISE)
 
 
 def fit_constraint(
-    config: IdentifyConfig,
-    mechanism: Mechanism,
-    rows: ConstraintRows,
-    progress: Progress | None = None,
-    others: Sequence[tuple[Build, ConstraintRows]] = (),
+    config: IdentifyConfig, mechanism: Mechanism, rows: ConstraintRows, progress: Progress | None = None
 ) -> ConstraintFit:
     """Fit the rows that have weight.
 
     Priors keep the links near nominal; the tool's offset, which no maker knows, is fitted first, with nominal links.
     Where the config names no noise, it is that of the residuals, in five rounds; for the intervals it is raised by the
     equations that the fit used up.
-
-    Args:
-        others: what makes the problem of the rows of each other kind, and these, in the order of the config.
     """
-    assert config.constraint is not None
-    build = _builder(config.constraint, mechanism, rows)
     names = [p.name for p in mechanism.geometry]
     # What an instrument shows has unknown frames fitted to the rows already, and these are free.
     unknown = mechanism.unknown_frames if isinstance(mechanism, Instrument) else ()
@@ -171,60 +133,56 @@ def fit_constraint(
     of_machine = [n for group in free.groups for n in group]
     tool = [] if isinstance(mechanism, Instrument) else [n for n in of_machine if n.startswith("tool_")]
     choice = ParameterChoice(of_machine, (), about.tied, {**_priors(config, mechanism, of_machine), **about.prior})
-    before = _tool_first(mechanism, rows, build, tool, choice)
-    solver = solver_of("lm", config)
-    sources = [_source(build, rows, config.noise, "noise")]
-    for i, (about_one, other) in enumerate(zip(config.constraint.beside, others, strict=True)):
-        sources.append(_source(*other, about_one.noise, f"constraint.beside.{i}.noise"))
-    rounds = 1 if all(bool(s.known.all()) for s in sources) else _ROUNDS
-    selection = select_parameters(mechanism.geometry, choice, before.geometry)
-    shared = len(selection.parameters)
+    rows = placed(rows, mechanism, exactly=not tool)
+    before, count = rows.seen, len(names)
+    if tool:
+        problem, whole = _problem(rows, count, ParameterChoice(free=tool), None)
+        before = before.with_nominal(whole.full(solve_lm(problem).values)[0])
+        rows = placed(rows, mechanism.with_nominal(before.nominal[:count]))
+    solver, noise = solver_of("lm", config), _noise(config, rows)
+    rounds = 1 if bool(noise.known.all()) else _ROUNDS
+    selection = select_parameters(mechanism.geometry, choice, before.nominal[:count])
     loss = config.robust or "squared"
-
-    def posed() -> tuple[list[Problem], Problem]:
-        """The problems of all rows under the noise as it is known by now, and the one of all of them."""
-        parts = [s.build(choice, before.geometry, s.sizes) for s in sources]
-        return parts, joined(parts, shared)
-
     for done in range(rounds):
-        parts, whole = posed()
-        fit = solver(whole, config.seed)
-        values = _values_of(parts, fit.values, shared)
-        for source, part, own in zip(sources, parts, values, strict=True):
-            source.noise = torch.where(source.known, source.noise, source.left(part, own))
+        problem, whole = _problem(rows, count, choice, noise.sizes)
+        fit = solver(problem, config.seed)
+        noise = noise.grown(noise.left(rows, problem, fit.values))
         if progress is not None:
             progress((done + 1) / rounds)
     if rounds > 1:
-        parts, whole = posed()
-        spared = float(what_is_known(reweighted(whole, fit.values, loss), fit.values).noise)
-        for source in sources:
-            more = max(1.0, spared) if spared < float("inf") else 1.0
-            source.noise = torch.where(source.known, source.noise, source.noise * more)
-        parts, whole = posed()
-    after = State(selection.full(fit.values[:, :shared])[0], parts[0], values[0], sources[0].sd(parts[0]))
-    known = what_is_known(reweighted(whole, fit.values, loss), fit.values)
-    beside = [s.told(p, own) for s, p, own in zip(sources[1:], parts[1:], values[1:], strict=True)]
-    return ConstraintFit(before, after, selection, known, fit, beside, _readings(sources[0], parts[0], values[0]))
+        problem = _problem(rows, count, choice, noise.sizes)[0]
+        spared = float(what_is_known(reweighted(problem, fit.values, loss), fit.values).noise)
+        noise = noise.grown(noise.size * (max(1.0, spared) if spared < float("inf") else 1.0))
+        problem = _problem(rows, count, choice, noise.sizes)[0]
+    after = rows.seen.with_nominal(whole.full(fit.values)[0])
+    known = what_is_known(reweighted(problem, fit.values, loss), fit.values)
+    read = _readings(noise, rows, problem, fit.values)
+    return ConstraintFit(before, after, selection, known, problem, fit, noise, read)
 
 
-def _source(build: Build, rows: ConstraintRows, noise: Any, key: str) -> _Source:
-    """Rows with the noise that is given: one for all, or by name; readings of an instrument in one unit share one."""
-    read = [] if rows.seen is None else [*rows.seen.pose[: rows.seen.compared]]
-    numbers = rows.seen.noise_groups() if isinstance(rows.seen, Instrument) else [0] * len(read)
-    values = torch.full((max(len(read), 1),), math.nan, dtype=torch.float64)
-    if isinstance(noise, dict):
-        values = sizes_by_name(noise, read, key, values.tolist())
-        # What is given by name is of that alone.
-        numbers = [n if math.isnan(v) else len(read) + k for k, (n, v) in enumerate(zip(numbers, values, strict=True))]
-    elif noise is not None:
-        values = torch.full_like(values, size(noise, rows.unit, key))
-        values = sizes_of_pose(noise, read, key) if len({*numbers}) > 1 else values
-    _require_sizes(values[~values.isnan()].tolist(), key, "remove the key")
-    every = sorted({*numbers}) or [0]
-    first = [numbers.index(n) if numbers else 0 for n in every]
-    group = {c.name: every.index(n) for c, n in zip(read, numbers, strict=True)} if len(every) > 1 else {}
-    known = ~values[first].isnan()
-    return _Source(build, rows, torch.where(known, values[first], _FIRST_NOISE), known, group)
+def _noise(config: IdentifyConfig, rows: ConstraintRows) -> _Noise:
+    """The noise that is given: one for all of a kind, or by name; readings of an instrument in one unit share one."""
+    assert config.constraint is not None
+    every = [*rows.seen.pose[: rows.seen.compared]]
+    names = [c.name for c in every]
+    numbers = rows.seen.noise_groups() if isinstance(rows.seen, Instrument) else [0] * len(every)
+    values = torch.full((len(every),), math.nan, dtype=torch.float64)
+    keys = ["noise", *(f"constraint.beside.{i}.noise" for i in range(len(config.constraint.beside)))]
+    given = [config.noise, *(about.noise for about in config.constraint.beside)]
+    for key, noise, read in zip(keys, given, rows.read, strict=True):
+        mine = [names.index(name) for name in read]
+        own = [every[k] for k in mine]
+        if isinstance(noise, dict):
+            values[mine] = sizes_by_name(noise, own, key, [math.nan] * len(own))
+            # What is given by name is of that alone.
+            numbers = [len(every) + k if k in mine and not values[k].isnan() else n for k, n in enumerate(numbers)]
+        elif noise is not None:
+            values[mine] = sizes_of_pose(noise, own, key)
+        _require_sizes([v for v in values[mine].tolist() if not math.isnan(v)], key, "remove the key")
+    groups = sorted({*numbers})
+    first = values[[numbers.index(n) for n in groups]]
+    group = {name: groups.index(n) for name, n in zip(names, numbers, strict=True)}
+    return _Noise(first.nan_to_num(nan=_FIRST_NOISE), ~first.isnan(), group)
 
 
 def _require_sizes(values: Sequence[float], key: str, instead: str) -> None:
@@ -232,104 +190,66 @@ def _require_sizes(values: Sequence[float], key: str, instead: str) -> None:
         raise InputError(f"{key}: {min(values):g} is no standard deviation; write a size above 0, or {instead}")
 
 
-def _readings(source: _Source, problem: Problem, values: Tensor) -> dict[str, dict[str, Any]]:
+def _readings(noise: _Noise, rows: ConstraintRows, problem: Problem, values: Tensor) -> dict[str, dict[str, Any]]:
     """What was read by name where noise is by reading: unit, rows, noise, and RMS before and after [SI]."""
-    if not source.group or source.rows.seen is None:
+    if len(noise.size) == 1:
         return {}
-    units = {c.name: c.unit for c in source.rows.seen.pose}
-    before, after = source.left(problem, problem.start), source.left(problem, values)
-    counts = source.rows.measured([*source.group]).sum(0).tolist()
+    units = {c.name: c.unit for c in rows.seen.pose}
+    before, after = noise.left(rows, problem, problem.start), noise.left(rows, problem, values)
+    counts = rows.measured([*noise.group]).sum(0).tolist()
     return {
         name: {
             "unit": units[name],
-            "rows": int(rows),
-            "noise": float(source.noise[i]),
-            "noise_known": bool(source.known[i]),
+            "rows": int(count),
+            "noise": noise.of(name),
+            "noise_known": bool(noise.known[i]),
             "before": float(before[i]),
             "after": float(after[i]),
         }
-        for (name, i), rows in zip(source.group.items(), counts, strict=True)
+        for (name, i), count in zip(noise.group.items(), counts, strict=True)
     }
 
 
-def _values_of(parts: Sequence[Problem], values: Tensor, shared: int) -> list[Tensor]:
-    """Of the values of all `1 x p` those of each part."""
-    own = torch.split(values[:, shared:], [len(p.parameters) - shared for p in parts], -1)
-    return [torch.cat([values[:, :shared], each], -1) for each in own]
-
-
-def _held_error(mechanism: Mechanism, rows: ConstraintRows, state: State, held: Tensor) -> PoseError:
+def _held_error(rows: ConstraintRows, seen: Mechanism, held: Tensor, sockets: bool) -> PoseError:
     """How far the tool of the held-out rows is from where the constraint holds it, `1 x t`; NaN of what was not read.
 
     In a socket: from the mean of the points that the rows with weight put into the same socket of the same placement,
-    which needs no fitted plate. Else |residual| of what was read, of lengths and of angles.
+    which needs no fitted plate. Else the difference of what was read, of lengths and of angles.
     """
-    if rows.seen is None:
-        far = scatter(tool_points(mechanism, rows.joints, state.geometry), rows.cell, rows.weights)
-        return PoseError(far[None, held], None)
-    names, left = [c.name for c in state.problem.channels], _residual(state.problem, state.values)[0] * state.noise
-    units, seen = {c.name: c.unit for c in rows.seen.pose}, rows.measured(names)
-    parts = []
-    for unit in ("m", "rad"):
-        mine = [k for k, name in enumerate(names) if units[name] == unit]
-        far = left[:, mine].norm(dim=-1)
-        parts.append((torch.where(seen[:, mine].any(-1), far, math.nan) if mine else far)[None, held])
-    return PoseError(parts[0], parts[1] if "rad" in units.values() else None)
+    if sockets:
+        assert isinstance(seen, Instrument)
+        points = tool_points(seen.mechanism, rows.joints)
+        return PoseError(scatter(points, rows.cell, rows.weights)[None, held], None)
+    joints, said = rows.joints[None, held], rows.said[None, held]
+    return seen.pose_error(seen.forward_kinematics(joints, guess=completed(seen, joints, said)), said)
 
 
-def _builder(about: Kind, mechanism: Mechanism, rows: ConstraintRows) -> Build:
-    if about.kind == "sockets":
-        several = len(torch.unique(rows.said, dim=0)) > 1
-        plate = _PLATE_TOLERANCE if several else 0.0
-        if isinstance(about, ConstraintConfig) and about.plate_tolerance is not None:
-            plate = size(about.plate_tolerance, "m", "constraint.plate_tolerance")
+def _problem(
+    rows: ConstraintRows, machine: int, choice: ParameterChoice, noise: Sizes | None
+) -> tuple[Problem, Selection]:
+    """The problem of the rows, and its parameters.
 
-        def sockets(choice: ParameterChoice, start: Tensor, noise: Any) -> Problem:
-            # Without noise there is nothing to weigh the plate's scale against.
-            scale = 0.0 if noise is None else plate
-            of = rows.joints, rows.group, rows.said
-            return socket_problem(mechanism, *of, noise, rows.weights, choice, start, scale)
-
-        return sockets
-
-    @lru_cache(maxsize=1)
-    def at(start: tuple[float, ...]) -> Mechanism:
-        """The machine and what reads it, where it suits these parameters."""
-        seen = read_by(rows, mechanism.with_nominal(torch.tensor(start, dtype=torch.float64)), about).seen
-        assert seen is not None
-        return seen
-
-    def read(choice: ParameterChoice, start: Tensor, noise: Any) -> Problem:
-        seen = at(tuple(start.tolist()))
-        # What an instrument adds to the machine's parameters comes behind them.
-        own = seen.geometry[len(mechanism.geometry) :]
-        if isinstance(noise, dict):
-            # What an instrument was pointed at is never compared.
-            noise = dict.fromkeys((c.name for c in seen.pose[seen.compared :]), 1.0) | noise
-        sizes = None if noise is None else sizes_of_pose(noise, seen.pose, "noise")
-        start = torch.cat([start, seen.nominal[len(start) :]])
-        choice = replace(choice, free=[*(choice.free or ()), *(p.name for p in own)])
-        # Held-out rows are in units of the noise, too.
-        problem = forward_problem(seen, rows.joints, rows.said, None, choice, sizes, start=start)
-        return replace(problem, weights=rows.weights[None])
-
-    return read
-
-
-def _beside(config: IdentifyConfig, mechanism: Mechanism) -> list[tuple[Build, ConstraintRows]]:
-    """What makes the problem of the rows of each other kind, and these."""
-    assert config.constraint is not None
-    found: list[tuple[Build, ConstraintRows]] = []
-    for about in config.constraint.beside:
-        if about.kind == "pose":
-            seen = mechanism if about.instrument is None else instrument(mechanism, [about.instrument])
-            rows = placed(poses_of(config, about.records, seen)[0])
-        else:
-            source = read_source(about.records, config.columns)
-            table = read_joints(source, mechanism, config.joint_map, config.columns)
-            rows = rows_of(table, mechanism, about)
-        found.append((_builder(about, mechanism, rows), rows))
-    return found
+    Args:
+        machine: how many parameters are the machine's; those of what reads it come behind them.
+        choice: of the machine's parameters; of the others all are free.
+    """
+    seen = rows.seen
+    own = seen.geometry[machine:]
+    unknown = seen.unknown_parts if isinstance(seen, Instrument) else ()
+    tolerances = {p.name: p.scale for p in own if p.scale and p.name.partition("_")[0] not in unknown}
+    # Without noise there is nothing to weigh a tolerance against.
+    names = [p.name for p in own if noise is not None or p.name not in tolerances]
+    prior = choice.prior if noise is None else {**choice.prior, **tolerances}
+    if isinstance(noise, dict):
+        # What an instrument was pointed at is never compared.
+        noise = dict.fromkeys((c.name for c in seen.pose[seen.compared :]), 1.0) | noise
+    sizes = None if noise is None else sizes_of_pose(noise, seen.pose, "noise")
+    choice = replace(choice, free=[*(choice.free or ()), *names], prior=prior)
+    # Held-out rows are in units of the noise, too.
+    problem = forward_problem(seen, rows.joints, rows.said, None, choice, sizes, start=seen.nominal)
+    problem = replace(problem, weights=rows.weights[None])
+    check_equations(problem)
+    return problem, select_parameters(seen.geometry, choice, seen.nominal)
 
 
 def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> dict[str, float]:
@@ -346,41 +266,6 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
     _require_sizes(values, key, "fix the parameters")
     priors = {p.name: v for p, v in zip(links, values, strict=True)}
     return priors | {n: _TOOL_TOLERANCE for n in free if n.startswith("tool_") and "tool" not in unknown}
-
-
-def _tool_first(
-    mechanism: Mechanism, rows: ConstraintRows, build: Build, tool: list[str], choice: ParameterChoice
-) -> State:
-    """The tool's offset with nominal links; where it is fixed, the constraint as its builder finds it at nominal."""
-    nominal = mechanism.nominal
-    if not tool:
-        problem = build(choice, nominal, _FIRST_NOISE)
-        return State(nominal, problem, problem.start, _sizes(rows, problem, _FIRST_NOISE))
-    alone = ParameterChoice(free=tool)
-    problem = build(alone, nominal, None)
-    values = solve_lm(problem).values
-    geometry = select_parameters(mechanism.geometry, alone, nominal).full(values[:, : len(tool)])[0]
-    return State(geometry, problem, values, _sizes(rows, problem, None))
-
-
-def _sizes(rows: ConstraintRows, problem: Problem, noise: float | None) -> Tensor:
-    """What the problem's channels `c` are divided by where all have one noise [m], or none [SI]."""
-    seen = rows.seen
-    if seen is None:
-        return torch.full((len(problem.channels),), 1.0 if noise is None else noise, dtype=torch.float64)
-    plain = torch.tensor([1 / ROTATION_WEIGHT if c.unit == "rad" else 1.0 for c in seen.pose], dtype=torch.float64)
-    return _of_channels(problem, seen, plain if noise is None else sizes_of_pose(noise, seen.pose, "noise"))
-
-
-def _of_channels(problem: Problem, seen: Mechanism, sizes: Tensor) -> Tensor:
-    """Of sizes of all that is read those of the problem's channels, `c`."""
-    names = [c.name for c in seen.pose]
-    return sizes[[names.index(c.name) for c in problem.channels]]
-
-
-def _residual(problem: Problem, values: Tensor) -> Tensor:
-    """`1 x s x c`, of all rows."""
-    return problem.residual(values[:, None], *problem.data).detach()
 
 
 # An interval above this share of its prior's is the prior's. Turning machine and plates together turns the residuals,
@@ -402,18 +287,19 @@ def identify_by_constraint(
         mechanism = rows.seen
         notes += [mechanism.note] if mechanism.note else []
     begun = time.perf_counter()
-    others = _beside(config, mechanism)
-    fit = fit_constraint(config, mechanism, rows, progress, others)
-    held = rows.weights == 0
-    before, after = (_held_error(mechanism, rows, s, held) for s in (fit.before, fit.after))
-    picture = drawn_sizes(mechanism, rows.joints[held], before.position[0], after.position[0], fit.after.geometry)
+    fit = fit_constraint(config, mechanism, rows, progress)
+    held, sockets = rows.weights == 0, config.constraint is not None and config.constraint.kind == "sockets"
+    before, after = (_held_error(rows, seen, held, sockets) for seen in (fit.before, fit.after))
+    count = len(mechanism.geometry)
+    sizes = before.position[0], after.position[0]
+    picture = drawn_sizes(mechanism, rows.joints[held], *sizes, fit.after.nominal[:count])
     if config.fits_again() and bool(held.any()):
         every = replace(rows, weights=torch.ones_like(rows.weights))
-        again = fit_constraint(config, mechanism, every, None, others)
+        again = fit_constraint(config, mechanism, every)
         fit = again if bool(again.fit.converged.all()) else fit
     outcome = Outcome(
         machines=torch.arange(1),
-        values=fit.after.geometry[None],
+        values=fit.after.nominal[None, :count],
         converged=fit.fit.converged,
         evaluations=fit.fit.evaluations,
         seconds=time.perf_counter() - begun,
@@ -426,15 +312,15 @@ def identify_by_constraint(
         view=mechanism,
         rows=Rows(rows.joints[None, ~held], rows.said[None, ~held]),
         test=Rows(rows.joints[None, held], rows.said[None, held]),
-        start=fit.before.geometry[None],
+        start=fit.before.nominal[None, :count],
         data_hash=rows.data_hash,
         notes=notes,
     )
-    noise = None if config.noise is None or fit.readings else float(fit.after.noise[0])
+    noise = None if config.noise is None or fit.readings else fit.noise.of(rows.read[0][0])
     found = Found(outcome, _known(fit), before, after)
     results, arrays = assemble(config, measured, fit.selection, {"lm": found}, noise, _only_by_prior(fit, found.known))
     results["constraint"] = _constraint(config, rows, fit)
-    if rows.in_sockets and bool(held.any()):
+    if sockets and bool(held.any()):
         # Other constraints show less than a place, to which new positions could not be held.
         first, last = (PoseError(error.position[0], None) for error in (before, after))
         results["promise"] = promise_block(first, last, configurations(rows.joints[held], mechanism.joints))
@@ -444,13 +330,8 @@ def identify_by_constraint(
 def _known(fit: ConstraintFit) -> Known:
     """The machine's part of what is known; a parameter that only its prior determines has no interval."""
     knowledge = fit.knowledge
-    prior = fit.after.problem.prior_sd
-    prior = torch.nn.functional.pad(prior, (0, knowledge.sd.shape[-1] - len(prior)), value=math.inf)
-    determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * prior)
-    noise = knowledge.noise if fit.after.problem.noise_known else torch.ones(1, dtype=torch.float64)
-    return known_of(
-        [replace(knowledge, sd=torch.where(determined, knowledge.sd, math.inf), noise=noise)], fit.selection
-    )
+    determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * fit.problem.prior_sd)
+    return known_of([replace(knowledge, sd=torch.where(determined, knowledge.sd, math.inf))], fit.selection)
 
 
 def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
@@ -460,10 +341,13 @@ def _only_by_prior(fit: ConstraintFit, known: Known) -> list[str]:
     return [f"No better known than by the tolerance given: {', '.join(prior)}."] if prior else []
 
 
+_BESIDE = ("rows", "unit", "noise", "before", "after")
+
+
 def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit) -> dict[str, Any]:
     """What was found of the constraint itself."""
     assert config.constraint is not None
-    every = zip(fit.after.problem.parameters, fit.after.values[0].tolist(), fit.knowledge.sd[0].tolist(), strict=False)
+    every = zip(fit.problem.parameters, fit.fit.values[0].tolist(), fit.knowledge.sd[0].tolist(), strict=False)
     unknowns = {
         parameter.name: {"value": value, "sd": sd if math.isfinite(sd) else None, "unit": parameter.unit}
         for parameter, value, sd in [*every][len(fit.selection.parameters) :]
@@ -476,11 +360,11 @@ def _constraint(config: IdentifyConfig, rows: ConstraintRows, fit: ConstraintFit
         ],
         "unknowns": unknowns,
         "unit": rows.unit,
-        "noise": float(fit.after.noise[0]),
+        "noise": fit.noise.of(rows.read[0][0]),
         "noise_known": config.noise is not None,
         "beside": [
-            {"kind": about.kind, "records": str(about.records), **found}
-            for about, found in zip(config.constraint.beside, fit.beside, strict=True)
+            {"kind": one.kind, "records": str(one.records), **{key: fit.readings[read[0]][key] for key in _BESIDE}}
+            for one, read in zip(config.constraint.beside, rows.read[1:], strict=True)
         ],
         "readings": fit.readings,
     }

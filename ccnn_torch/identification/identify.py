@@ -19,7 +19,7 @@ from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig, base_method
 from ccnn_torch.identification.constrained import identify_by_constraint
 from ccnn_torch.identification.judge import drawn_errors, read_elsewhere, transferred
-from ccnn_torch.identification.measured import Measured, from_records, nominal_machine
+from ccnn_torch.identification.measured import Measured, from_records, held_by_priors, nominal_machine
 from ccnn_torch.identification.page import identified_page, not_settled, write_identified_csv, write_identified_report
 from ccnn_torch.identification.result import Found, assemble, beside_truth, judged, known_at, promised
 from ccnn_torch.identification.simulated import count_study, simulate
@@ -35,7 +35,7 @@ from ccnn_torch.identification.solve import (
     select,
     solver_of,
 )
-from ccnn_torch.mechanisms import Framed, Giving, Instrument, Mechanism, Seen, SetUps
+from ccnn_torch.mechanisms import Framed, Giving, Mechanism, SetUps
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
@@ -122,15 +122,12 @@ def identify(
     Raises:
         InputError: the config, the mechanism or the data cannot be used; one sentence.
     """
-    if config.constraint is not None:
-        progress = None if watch is None else watch("lm")
-        return Identification(config, *identify_by_constraint(config, progress, given), given=given)
-    mechanism, measured = prepare(config, given)
-    plain = config.residual == "auto" and config.methods == ["lm"]
-    of_each = isinstance(config.noise, dict) and not isinstance(measured.mechanism, Instrument)
-    if isinstance(measured.mechanism, Seen) and plain and not of_each:
-        # Parts of poses leave much open: links stay near nominal by priors, as beside any constraint.
-        held = config.model_copy(update={"constraint": ConstraintConfig(kind="pose")})
+    held = config
+    if config.constraint is None:
+        mechanism, measured = prepare(config, given)
+        if held_by_priors(config, measured.mechanism):
+            held = config.model_copy(update={"constraint": ConstraintConfig(kind="pose")})
+    if held.constraint is not None:
         progress = None if watch is None else watch("lm")
         return Identification(config, *identify_by_constraint(held, progress, given), given=given)
     elsewhere = read_elsewhere(config, mechanism)

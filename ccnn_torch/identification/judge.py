@@ -277,3 +277,23 @@ def transferred(config: IdentifyConfig, elsewhere: Elsewhere, values: Tensor) ->
         "rows": {"train": train.joints.shape[1], "test": test.joints.shape[1]},
         "test": before_and_after(errors[0], errors[1]),
     }
+
+
+def scatter(points: Tensor, group: Tensor, weights: Tensor) -> Tensor:
+    """Distance of every point from the mean of its group's points that count, `s` [m]: what a held point shows.
+
+    Args:
+        points: `s x 3` [m].
+        group: number of each point's group, `s`, any numbers.
+        weights: `s` [1]; the means are of the rows with weight, the distances of all rows.
+
+    Raises:
+        InputError: a group has no row that counts.
+    """
+    numbers, which = torch.unique(group, return_inverse=True)
+    total = torch.zeros(len(numbers), dtype=points.dtype).index_add(0, which, weights)
+    if bool((total <= 0).any()):
+        raise InputError(f"group {float(numbers[total <= 0][0]):g} has no row that counts, so it has no mean")
+    mean = torch.zeros(len(numbers), 3, dtype=points.dtype).index_add(0, which, points * weights[:, None])
+    distance: Tensor = torch.linalg.vector_norm(points - (mean / total[:, None])[which], dim=-1)
+    return distance

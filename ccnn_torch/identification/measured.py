@@ -169,6 +169,13 @@ def nominal_machine(config: IdentifyConfig) -> Mechanism:
     return mechanism.with_link_frames()
 
 
+def held_by_priors(config: IdentifyConfig, mechanism: Mechanism) -> bool:
+    """Whether links stay near nominal by priors, as beside a constraint: parts of poses leave much open."""
+    plain = config.residual == "auto" and config.methods == ["lm"]
+    of_each = isinstance(config.noise, dict) and not isinstance(mechanism, Instrument)
+    return isinstance(mechanism, Seen) and plain and not of_each
+
+
 def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> Measured:
     """Load and split the records of a config, or those that Python has."""
     assert config.records is not None
@@ -177,7 +184,9 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
     split = split_records(config, records)
     train, test = rows_of_split(records, split)
     columns = {name: values[split.train.numpy()] for name, values in records.columns.items()}
-    start, far = _start(mechanism, train, columns), list[str]()
+    # As beside a constraint the frames are fitted with the rest.
+    start = mechanism.nominal[None] if held_by_priors(config, mechanism) else _start(mechanism, train, columns)
+    far = list[str]()
     if isinstance(mechanism, SerialArm):
         far = judge_frames(mechanism, train.joints[0], train.observed[0], start, where=records.path)
     joint_noise = None

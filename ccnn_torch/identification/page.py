@@ -58,9 +58,11 @@ def holder(results: Mapping[str, Any]) -> str:
     return _HOLDERS[results["constraint"]["kind"]]
 
 
-def _readings_table(readings: Mapping[str, Any]) -> Table:
-    """What instruments read: noise and RMS of each."""
-    rows = []
+def _readings_table(results: Mapping[str, Any]) -> Table | None:
+    """What was read, of several kinds: noise and RMS of each."""
+    readings, rows = results.get("constraint", {}).get("readings"), []
+    if not readings:
+        return None
     for name, block in readings.items():
         scale, unit = display_unit(block["unit"], block["noise"])
         sizes = (number_text(block[key] / scale, 3) for key in ("before", "after", "noise"))
@@ -74,8 +76,6 @@ def constraint_table(results: Mapping[str, Any]) -> Table | None:
     about = results.get("constraint")
     if about is None:
         return None
-    if about.get("readings"):
-        return _readings_table(about["readings"])
     rows = []
     for name, block in about["unknowns"].items():
         scale, unit = display_unit(block["unit"], block["sd"] or 1.0)
@@ -91,14 +91,8 @@ def constraint_table(results: Mapping[str, Any]) -> Table | None:
         f"{number_text(about['noise'] / scale, 3)} {unit}, {source}. "
         "Turns count from where the nominal machine sees them."
     )
-    # Files of earlier versions have none.
-    for one in about.get("beside", []):
-        scale, unit = display_unit(one.get("unit", "m"), one["after"])
-        before, after = (number_text(one[when] / scale, 3) for when in ("before", "after"))
-        note += (
-            f" In the same fit: {count_text(one['rows'], 'row')} of {Path(one['records']).name} ({one['kind']}), "
-            f"off by {before} {unit} RMS before and {after} {unit} after; none of them is held out."
-        )
+    if not rows and about.get("readings"):
+        return None
     if not rows:
         return Table("Rows", ("kind", "rows"), ((about["kind"], str(count)),), note)
     return Table(f"What held the tool ({about['kind']})", ("unknown", "value", "standard deviation"), tuple(rows), note)
@@ -167,6 +161,7 @@ def identified_tables(results: Block) -> list[Table]:
         _deviation_table(results),
         _transfer_table(results),
         constraint_table(results),
+        _readings_table(results),
         _compensation_table(results),
         _count_table(results),
     ]

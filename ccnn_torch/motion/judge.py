@@ -21,11 +21,10 @@ from torch import Tensor
 from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.evidence.judge import judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams
-from ccnn_torch.evidence.priors import OUTSIDE, crowd
 from ccnn_torch.motion.descent import sensitivities
 from ccnn_torch.motion.fit import products, side_by_side, squares_unseen, weighed
 from ccnn_torch.motion.problem import Problem
-from ccnn_torch.motion.search import Search, log_posterior
+from ccnn_torch.motion.search import Search, prior_of
 from ccnn_torch.motion.spec import Fit, Spec
 from ccnn_torch.motion.stretches import direction
 from ccnn_torch.motion.whiten import white_noise
@@ -208,11 +207,6 @@ class Candidate(NamedTuple):
     rows: tuple[Tensor, Tensor, Tensor] | None = None
 
 
-def prior_of(fit: Fit) -> float:
-    """Log prior of a set."""
-    return log_posterior(fit) - fit.log_evidence
-
-
 def essential(members: Members, left: Mapping[Members, float], unseen: Mapping[Members, float]) -> Members:
     """The set without members that take nothing away, the least first.
 
@@ -259,9 +253,9 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     left_plain, columns_plain = sensitivities(problem, plainly, theta, at, places)
     sets: list[tuple[int, Candidate]] = []
     for b, base in enumerate(bases):
-        own, count = columns[b, : len(places[b])], len(base.members)
+        own = columns[b, : len(places[b])]
         y = residual[b] + theta[b, list(places[b])] @ own
-        prior = prior_of(base) + OUTSIDE + crowd(count + 1) - crowd(count)
+        prior = prior_of(base, drivers=1)
         for k, (driver, beside) in enumerate(zip(drivers, white, strict=True)):
             x = torch.cat([own, beside])
             grams = products(found.nuisance[axis], x, y, values)

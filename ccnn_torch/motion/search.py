@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.priors import EFFECT, crowd
+from ccnn_torch.evidence.priors import EFFECT, OUTSIDE, crowd
 from ccnn_torch.motion.descent import sensitivities, white_residual
 from ccnn_torch.motion.fit import fit_many, form_errors, products, side_by_side, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
@@ -64,8 +64,13 @@ class Search(NamedTuple):
 
 def log_posterior(fit: Fit) -> float:
     """Log evidence with the prior of the set, not normalised."""
+    return fit.log_evidence + prior_of(fit)
+
+
+def prior_of(fit: Fit, drivers: int = 0) -> float:
+    """Log prior of a set, beside so many drivers of something outside the library."""
     count = len(fit.members)
-    return fit.log_evidence + fit.spec.log_prior + EFFECT * count + crowd(count)
+    return fit.spec.log_prior + EFFECT * count + OUTSIDE * drivers + crowd(count + drivers)
 
 
 def search(problem: Problem) -> Search:
@@ -154,7 +159,7 @@ class _Pool:
         if variance is not None and new:
             weighed_new = weighed(side_by_side(new), self.nuisance.shape[1], [f.spec.groups for f in new], variance)
             for fit, evidence in zip(new, weighed_new.log_evidence.tolist(), strict=True):
-                old[variance, fit.members] = evidence + log_posterior(fit) - fit.log_evidence, fit
+                old[variance, fit.members] = evidence + prior_of(fit), fit
         found = [(log_posterior(fit), fit) if variance is None else old[variance, fit.members] for fit in fits]
         return sorted(found, key=lambda one: (-_level(one[0]), one[1].members))
 

@@ -21,7 +21,7 @@ from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, pose_residual, reached
 from ccnn_torch.effects.found_machine import machine_of_block
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.constraints import scatter
+from ccnn_torch.identification.judge import scatter
 from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames, load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import load_records

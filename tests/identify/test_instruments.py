@@ -209,8 +209,15 @@ def test_rows_of_a_gauge_a_level_and_wires_stand_in_one_fit(tmp_path: Path) -> N
         noise="5 um",
         seed=0,
     )
-    blocks = found.results["constraint"]["beside"]
-    assert [b["unit"] for b in blocks] == ["rad", "m"]
+    read = found.results["constraint"]["readings"]
+    # The wire's distances stand beside those of the first file, and have a name in front.
+    assert {n: (b["unit"], b["rows"]) for n, b in read.items()} == {
+        "distance": ("m", 80),
+        "tilt_x": ("rad", 80),
+        "tilt_y": ("rad", 80),
+        "beside2.distance": ("m", 80),
+    }
+    blocks = [read["tilt_x"], read["beside2.distance"]]
     assert all(0.5 < b["after"] / b["noise"] < 1.3 < b["before"] / b["noise"] for b in blocks)
     truth = {
         f"{n}{i + 1}": v

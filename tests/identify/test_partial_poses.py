@@ -67,12 +67,11 @@ def test_poses_are_compared_where_the_joints_of_a_pose_are_not_unique() -> None:
 
 
 def test_the_default_tolerance_fits_machines_without_angles(tmp_path: Path) -> None:
-    stewart = load_mechanism("stewart")
-    joints = stewart.sample_joints(12, torch.Generator().manual_seed(0))
-    columns = {f"q{k + 1}[m]": joints[:, k].numpy() for k in range(6)}
+    joints = load_mechanism("tripod").sample_joints(12, torch.Generator().manual_seed(0))
+    columns = {f"q{k + 1}[m]": joints[:, k].numpy() for k in range(3)}
     write_table(tmp_path / "few.csv", columns | {"anchor[1]": 0 * columns["q1[m]"], "distance[m]": columns["q1[m]"]})
     found = identify(
-        mechanism="stewart", records=str(tmp_path / "few.csv"), constraint={"kind": "distances"}, refit=False
+        mechanism="tripod", records=str(tmp_path / "few.csv"), constraint={"kind": "distances"}, refit=False
     )
     assert found.results["constraint"]["kind"] == "distances"
 
@@ -101,11 +100,13 @@ def test_heights_and_distances_in_one_fit_make_the_bed_flat_and_parts_of_the_rig
     found = identify(**keys, noise="20 um", split={"test": 0.2}, constraint=constraint)
     with pytest.raises(InputError, match="has distances between two places, q1_b …, which no anchor"):
         identify(**keys, constraint={"kind": "distances", "by": ["q1"]})
-    block = found.results["constraint"]["beside"][0]
-    assert (block["kind"], block["rows"]) == ("pose", 40) and block["after"] < 1.5e-5 < 1e-4 < block["before"]
+    block = found.results["constraint"]["readings"]["z"]
+    assert block["rows"] == 40 and block["noise_known"] and block["after"] < 1.5e-5 < 1e-4 < block["before"]
+    assert found.results["constraint"]["beside"][0]["after"] == block["after"]
+    assert found.results["rows"] == {"train": 46, "per_leg": {}, "test": 2}
     found.save(tmp_path / "out")
     told = (tmp_path / "out" / "identified.md").read_text()
-    assert "In the same fit: 40 rows of bed.csv (pose), off by " in told and "none of them is held out" in told
+    assert "| z [µm] | 40 |" in told and "| given |" in told
     elsewhere = _bed(60, 9)
 
     def made(machine: Mechanism) -> tuple[float, float]:

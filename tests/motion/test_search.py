@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from motion.servo import KEYS, write_log
 
 from ccnn_torch.motion import load_logs, nominal_of
 from ccnn_torch.motion.effects import motion_effects
-from ccnn_torch.motion.search import _Pool
+from ccnn_torch.motion.search import _Pool, log_posterior, prior_of
 from ccnn_torch.motion.setting import problem_of
+from ccnn_torch.motion.spec import Fit, Spec
 from ccnn_torch.motion.stretches import smooth_speed
 from ccnn_torch.motion.whiten import white_noise
 
@@ -30,6 +32,19 @@ def test_no_screen_leaves_an_effect_out_beside_one_other(tmp_path: Path) -> None
     fit = next(f for f in found.values() if f.settled and f.members)
     pool.fit([[fit.spec]], 3)
     assert found[fit.members] is fit
+
+
+def fit_of(count: int, evidence: float) -> Fit:
+    """A set of so many effects whose model says so much."""
+    spec, nothing = Spec(tuple(range(count)), torch.zeros(0), (), 0.0), torch.zeros(0)
+    return Fit(spec, evidence, 1.0, nothing, 0.0, 0.0, 0.0, 0.0, None, True)  # type: ignore[arg-type]
+
+
+def test_an_effect_must_be_ten_times_as_likely_and_something_outside_a_thousand_times() -> None:
+    none = log_posterior(fit_of(0, 0.0))
+    assert log_posterior(fit_of(1, 2.2)) < none < log_posterior(fit_of(1, 2.4))
+    assert log_posterior(fit_of(3, 9.1)) < none < log_posterior(fit_of(3, 9.3))
+    assert 6.8 + prior_of(fit_of(0, 0.0), drivers=1) < none < 7.0 + prior_of(fit_of(0, 0.0), drivers=1)
 
 
 def test_speeds_are_slopes_of_parabolas_up_to_the_ends() -> None:

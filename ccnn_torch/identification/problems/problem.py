@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -76,63 +76,6 @@ def check_equations(problem: Problem) -> None:
             f"{rows} rows of {count_text(channels, 'equation')}{priors} cannot determine {k} free parameters; "
             f"measure at least {needed} rows, or fix parameters"
         )
-
-
-def joined(parts: Sequence[Problem], shared: int) -> Problem:
-    """One problem of rows of several kinds, in the order of the parts; channels that a kind lacks are 0 in its rows.
-
-    Args:
-        parts: of the same machines; the first `shared` parameters are the same in all, with the same start and prior.
-
-    Raises:
-        InputError: fewer equations than parameters.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    first, width = parts[0], max(len(p.channels) for p in parts)
-    counts = [p.weights.shape[-1] for p in parts]
-    kinds = torch.cat([torch.full((1, n, 1), float(i), dtype=torch.float64) for i, n in enumerate(counts)], 1)
-    data = [kinds]
-    for i, part in enumerate(parts):
-        before, after = sum(counts[:i]), sum(counts[i + 1 :])
-        # Rows of other kinds stand for the first one here, and what comes of them is left out.
-        data += [torch.cat([d[:, :1].expand(-1, before, -1), d, d[:, :1].expand(-1, after, -1)], 1) for d in part.data]
-
-    def residual(values: Tensor, kind: Tensor, *rows: Tensor) -> Tensor:
-        found, own, there = torch.zeros((), dtype=values.dtype), shared, 0
-        for i, part in enumerate(parts):
-            more = len(part.parameters) - shared
-            mine = torch.cat([values[..., :shared], values[..., own : own + more]], -1)
-            left = part.residual(mine, *rows[there : there + len(part.data)])
-            left = torch.nn.functional.pad(left, (0, width - left.shape[-1]))
-            found = torch.where(kind == i, left, found)
-            own, there = own + more, there + len(part.data)
-        return found
-
-    def each(name: str) -> Tensor:
-        own = [getattr(p, name)[..., shared:] for p in parts]
-        return torch.cat([getattr(first, name)[..., :shared], *own], -1)
-
-    problem = Problem(
-        parameters=(*first.parameters[:shared], *(q for p in parts for q in p.parameters[shared:])),
-        start=each("start"),
-        scale=each("scale"),
-        prior_sd=each("prior_sd"),
-        residual=residual,
-        data=tuple(data),
-        weights=torch.cat([p.weights for p in parts], -1),
-        channels=next(p.channels for p in parts if len(p.channels) == width),
-        noise_known=all(p.noise_known for p in parts),
-    )
-    if any(p.missing is not None for p in parts):
-        none = torch.zeros(1, 1, dtype=torch.int64)
-        own = [(none if p.missing is None else p.missing).expand(1, n) for p, n in zip(parts, counts, strict=True)]
-        problem = dataclasses.replace(problem, missing=torch.cat(own, -1))
-    equations = sum(int(p.equations.min()) for p in parts)
-    unknown = len(problem.parameters) - int(torch.isfinite(problem.prior_sd).sum())
-    if equations < unknown:
-        raise InputError(f"{equations} equations cannot determine {unknown} free parameters; measure more, or fix some")
-    return problem
 
 
 @dataclass(frozen=True)

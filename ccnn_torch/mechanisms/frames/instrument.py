@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -114,7 +115,12 @@ class Instrument(Seen):
             return ()
         unknown: tuple[str, ...] = getattr(self.mechanism, "unknown_frames", ())
         shown = [name for name in unknown if not all(name in part.blind for part in self.parts)]
-        return (*shown, *(name for part in self.parts for name in part.unknown))
+        return (*shown, *self.unknown_parts)
+
+    @property
+    def unknown_parts(self) -> tuple[str, ...]:
+        """Of these names those of the instruments themselves, whether or not they are known by now."""
+        return tuple(name for part in self.parts for name in part.unknown)
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
         """As of a mechanism; nothing is unknown any more where values are not those that it was made with."""
@@ -257,12 +263,16 @@ class Instrument(Seen):
 
         return frame_jacobian(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype))
 
-    def _rows_of(self, rows: Tensor) -> list[Tensor]:
-        """What each instrument read and was pointed at, `s x (c + g)` each."""
-        found, read, given = [], 0, self.compared
-        for reading in (part.reading for part in self.parts):
-            ends = read + len(reading.read), given + len(reading.given)
-            found.append(torch.cat([rows[:, read : ends[0]], rows[:, given : ends[1]]], -1))
+    def _shown(self, joints: Tensor, rows: Tensor) -> list[tuple[Part, Tensor, Tensor, Tensor]]:
+        """Each instrument with the joints `t x n` at which it read, and what it read and was pointed at there,
+        `t x (c + g)`, and the latter alone."""
+        found, read, given = list[tuple[Part, Tensor, Tensor, Tensor]](), 0, self.compared
+        for part in self.parts:
+            count = len(part.reading.read)
+            ends = read + count, given + len(part.reading.given)
+            mine = torch.cat([rows[:, read : ends[0]], rows[:, given : ends[1]]], -1)
+            whole = ~mine.isnan().any(-1)
+            found.append((part, joints[whole], mine[whole], mine[whole, count:]))
             read, given = ends
         return found
 
@@ -298,11 +308,21 @@ class Instrument(Seen):
         flat = [self._fitted_to(joints, pose, w, self.unknown_frames) for w in weights.reshape(-1, len(joints))]
         return torch.stack(flat).reshape(*weights.shape[:-1], -1)
 
+    def suited(self, joints: Tensor, pose: Tensor) -> Instrument:
+        """Itself where closed forms put the instruments by rows, their parameters counted from where rows show them."""
+        parts, machine = list[Part](), self.mechanism.nominal
+        values = [machine]
+        for part, q, rows, given in self._shown(joints, pose):
+            place = place_with(self.mechanism, part, q, machine, given)
+            parts.append(replace(part, reading=part.reading.suited(place, rows)))
+            own = torch.tensor([p.nominal for p in parts[-1].parameters], dtype=torch.float64)
+            values.append(parts[-1].start(place, rows, own))
+        return Instrument(self.mechanism, *parts).with_nominal(torch.cat(values))  # type: ignore[return-value]
+
     def placed(self, joints: Tensor, pose: Tensor) -> Instrument:
         """Itself where the instruments stand as suits rows best, the machine, its frames and a lens as they are."""
         lens = [name for part in self.parts if part.reading.looks for name in map(part.called, part.reading.unknown)]
-        own = (name for part in self.parts for name in part.unknown)
-        unknown = () if self.known else tuple(name for name in own if name not in lens)
+        unknown = () if self.known else tuple(name for name in self.unknown_parts if name not in lens)
         weights = torch.ones(len(joints), dtype=torch.float64)
         return self.with_nominal(self._fitted_to(joints, pose, weights, unknown))  # type: ignore[return-value]
 
@@ -358,21 +378,16 @@ class Instrument(Seen):
     def _begun(self, joints: Tensor, rows: Tensor, unknown: Sequence[str]) -> Tensor:
         """All parameters near those that suit rows, from closed forms."""
         start, arm, first = self.nominal.clone(), self.mechanism, len(self.mechanism.geometry)
-        own = torch.split(start[first:], [len(part.parameters) for part in self.parts])
-        each = []
-        for part, mine in zip(self.parts, self._rows_of(rows), strict=True):
-            whole = ~mine.isnan().any(-1)
-            each.append((part, joints[whole], mine[whole]))
+        own, each = torch.split(start[first:], [len(part.parameters) for part in self.parts]), self._shown(joints, rows)
         if isinstance(arm, SerialArm) and {*arm.unknown_frames} & {*unknown}:
-            for (part, q, mine), values in zip(each, own, strict=True):
+            for (part, q, mine, _), values in zip(each, own, strict=True):
                 stands, poses = (q, None) if part.place else part.reading.frames(q, mine, values)
                 if poses is not None:
                     shown = arm if poses.shape[-1] == len(arm.pose) else arm.with_orientation("none")
                     start[:first] = fit_frames(shown, stands, poses)
                     break
         found = [start[:first]]
-        for (part, q, mine), values in zip(each, own, strict=True):
-            given = mine[:, len(part.reading.read) :]
+        for (part, q, mine, given), values in zip(each, own, strict=True):
             found.append(part.start(place_with(arm, part, q, start[:first], given), mine, values))
         return torch.cat(found)
 
@@ -408,16 +423,24 @@ def instrument(mechanism: Mechanism, instruments: Sequence[Mapping[str, Any]]) -
     """
     if isinstance(instruments, str | Mapping) or not instruments:
         raise InputError("instruments: write a list, e.g. [{kind: wire, anchors: 2}, {kind: level}, {kind: pose}]")
-    parts = []
-    for about in instruments:
-        if not isinstance(about, Mapping) or not isinstance(about.get("kind"), str):
-            raise InputError(f"instruments: {about!r} has no kind; write one of {', '.join(READINGS)}")
-        keys = {k: v for k, v in about.items() if k not in ("kind", "link", "name", "own_point")}
-        reading = make_reading(about["kind"], keys, mechanism)
-        camera = reading.looks and len(instruments) > 1
-        if camera:
-            # What it does not look at in a row must not spoil the row.
-            reading.behind = 1.0
-        place = "camera" if camera else "point" if about.get("own_point") else ""
-        parts.append(Part(reading, about.get("link"), str(about.get("name") or ""), place))
-    return Instrument(mechanism, *parts)
+    return Instrument(mechanism, *(make_part(about, mechanism, len(instruments) > 1) for about in instruments))
+
+
+def make_part(about: Mapping[str, Any], mechanism: Mechanism, among: bool = False) -> Part:
+    """One instrument of a mechanism, from its kind and keys.
+
+    among: whether it stands beside others, so that a camera has a place of its own.
+
+    Raises:
+        InputError: a kind or key that is not known.
+    """
+    if not isinstance(about, Mapping) or not isinstance(about.get("kind"), str):
+        raise InputError(f"instruments: {about!r} has no kind; write one of {', '.join(READINGS)}")
+    keys = {k: v for k, v in about.items() if k not in ("kind", "link", "name", "own_point")}
+    reading = make_reading(about["kind"], keys, mechanism)
+    camera = reading.looks and among
+    if camera:
+        # What it does not look at in a row must not spoil the row.
+        reading.behind = 1.0
+    place = "camera" if camera else "point" if about.get("own_point") else ""
+    return Part(reading, about.get("link"), str(about.get("name") or ""), place)

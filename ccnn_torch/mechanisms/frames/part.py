@@ -158,4 +158,10 @@ def place_of(mechanism: Mechanism, link: int | None, joints: Tensor, values: Ten
         return Place(position, rotation, joints)
     if isinstance(mechanism, SerialArm):
         return Place(*mechanism.forward_frame(joints, values), joints)
-    return Place(*mechanism.frame(mechanism.forward_kinematics(joints, values)), joints)
+    pose = mechanism.forward_kinematics(joints, values)
+    return Place(*mechanism.frame(pose), joints, pose)
+
+
+def tool_points(mechanism: Mechanism, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+    """Position of the tool, `... x 3` [m]; joints `... x n` [SI], parameters `... x k` [SI]."""
+    return place_of(mechanism, None, joints, mechanism.resolve(parameters)).position

@@ -38,12 +38,14 @@ _BEHIND = 1e-3
 class Place(NamedTuple):
     """Position `... x 3` [m] and rotation `... x 3 x 3` (or None) of what holds the instrument, joints `... x n`.
 
+    pose: `... x p`, of a machine that is no serial arm.
     second, turned: position and rotation with the joints that are given, where the reading is of two places.
     """
 
     position: Tensor
     rotation: Tensor | None
     joints: Tensor
+    pose: Tensor | None = None
     second: Tensor | None = None
     turned: Tensor | None = None
 
@@ -92,6 +94,10 @@ class Reading(ABC):
     def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
         """Its parameters near those that suit rows `s x (c + g)`, from the nominal ones, `m` [SI]."""
         return own
+
+    def suited(self, place: Place, rows: Tensor) -> Reading:
+        """The same, with its parameters counted from where these rows `s x (c + g)` show it, as far as that helps."""
+        return self
 
     def frames(self, joints: Tensor, rows: Tensor, own: Tensor) -> tuple[Tensor, Tensor | None]:
         """Stands of the machine `t x n` and the whole poses that the rows show there, `t x 6`; None where none are."""
@@ -157,7 +163,7 @@ class Camera(Reading):
         assert place.rotation is not None
         point = given[..., :3]
         if self.corners:
-            point = point + _chosen(own[..., _LENS:], given[..., 3], 3, _numbers(self.corners, "corners"))
+            point = point + chosen(own[..., _LENS:], given[..., 3], 3, _numbers(self.corners, "corners"))
         if self.on_hand:
             seen = (place.rotation.mT @ (point - place.position)[..., None])[..., 0]
         else:
@@ -198,7 +204,7 @@ class Wire(Reading):
         )
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
-        return _apart(place.position, _chosen(own, given[..., 0], 3, self.groups))
+        return _apart(place.position, chosen(own, given[..., 0], 3, self.groups))
 
     def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
         """|p|² - d² = 2 p·a - |a|² is linear in a and |a|²."""
@@ -259,11 +265,20 @@ class Dial(Reading):
         )
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
-        mine = _chosen(own, given[..., 0], 3, self.groups)
-        axes = self.axes[_number(given[..., 0], self.groups)]
+        mine = chosen(own, given[..., 0], 3, self.groups)
+        axes = self.axes[number_of(given[..., 0], self.groups)]
         turn = (mine[..., 1:, None] * axes[..., 1:, :]).sum(-2)
         normal = (rotation_vector_to_matrix(turn) @ axes[..., 0, :, None])[..., 0]
         return (place.position * normal).sum(-1, keepdim=True) - mine[..., :1]
+
+    def suited(self, place: Place, rows: Tensor) -> Reading:
+        """Normals of the planes near the points, towards where the readings rise."""
+        normals = []
+        for points, read in _by_group(place, rows, self.groups, "plane"):
+            normal = torch.linalg.svd(points - points.mean(0), full_matrices=True)[2][-1]
+            rising = float(((points @ normal) * (read - read.mean())).sum())
+            normals.append((-normal if rising < 0 else normal).tolist())
+        return Dial(normals, self.groups)
 
     def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
         """The heights; the normals as they are."""
@@ -323,7 +338,10 @@ class Encoder(Reading):
 
 
 class Pose(Reading):
-    """What a tracker or a probe sees of the tool's pose: any of x, y, z, and all of rx, ry, rz or none."""
+    """What a tracker or a probe sees of the tool's pose: any of x, y, z, and all of rx, ry, rz or none.
+
+    Of a machine that has other coordinates (a tripod's phi) some of its own.
+    """
 
     kind = "pose"
     unknown = ()
@@ -334,19 +352,27 @@ class Pose(Reading):
         turned = bool(mechanism.orientations) or mechanism.frame(mechanism.home_pose)[1] is not None
         names = [c.name for c in (CHANNELS if turned else CHANNELS[:3])]
         wanted = names if pose is None else [*pose]
+        self._own = bool(wanted) and not set(wanted) <= set(names) and set(wanted) <= {c.name for c in mechanism.pose}
+        self.keys = {} if pose is None else {"pose": wanted}
+        if self._own:
+            self.read = tuple(c for c in mechanism.pose if c.name in wanted)
+            self._seen = [mechanism.pose.index(c) for c in self.read]
+            return
         angles = sum(name in names[3:] for name in wanted)
         if not wanted or not set(wanted) <= set(names) or angles not in (0, 3):
             raise InputError(
                 f"pose: write some of {', '.join(names[:3])}{', and all of rx, ry, rz or none' if turned else ''}, "
                 f"not {pose!r}"
             )
-        self.keys = {} if pose is None else {"pose": wanted}
         self.turns = angles > 0
         self._seen = [k for k, name in enumerate(names) if name in wanted]
         self.read = tuple(CHANNELS[k] for k in self._seen)
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
         whole = place.position
+        if self._own:
+            assert place.pose is not None
+            whole = place.pose
         if self.turns:
             assert place.rotation is not None
             whole = torch.cat([whole, matrix_to_rotation_vector(place.rotation)], -1)
@@ -355,7 +381,8 @@ class Pose(Reading):
     def frames(self, joints: Tensor, rows: Tensor, own: Tensor) -> tuple[Tensor, Tensor | None]:
         """As measured, where positions were."""
         there = (rows if self.turns else rows[:, :3])[:, : len(self._seen)]
-        return joints, there if self._seen[:3] == [0, 1, 2] and len(joints) >= _POSES else None
+        whole = self._seen[:3] == [0, 1, 2] and not self._own and len(joints) >= _POSES
+        return joints, there if whole else None
 
 
 _EVERY = (Camera, Wire, Dial, Level, Encoder, Between, Pose)
@@ -398,14 +425,14 @@ def _numbers(given: int | Sequence[float], key: str, count: int | None = None) -
     return found
 
 
-def _number(column: Tensor, groups: Sequence[float]) -> Tensor:
+def number_of(column: Tensor, groups: Sequence[float]) -> Tensor:
     """Which of the groups each row is of, from 0; what is no group's number is the nearest's."""
     return (column[..., None] - torch.tensor(groups, dtype=column.dtype)).abs().argmin(-1)
 
 
-def _chosen(own: Tensor, column: Tensor, width: int, groups: Sequence[float]) -> Tensor:
+def chosen(own: Tensor, column: Tensor, width: int, groups: Sequence[float]) -> Tensor:
     """Of the parameters of all groups `... x (g w)` those of each row's, `... x w`."""
-    number = _number(column, groups)
+    number = number_of(column, groups)
     index = number[..., None] * width + torch.arange(width)
     return expand_leading(own, index).gather(-1, expand_leading(index, own))
 
@@ -417,7 +444,7 @@ def _by_group(place: Place, rows: Tensor, groups: Sequence[float], what: str) ->
         InputError: a group of fewer than four rows.
     """
     for i, label in enumerate(groups):
-        mine = _number(rows[:, 1], groups) == i
+        mine = number_of(rows[:, 1], groups) == i
         if int(mine.sum()) < _FEWEST:
             raise InputError(
                 f"{what} {label:g}: needs at least {_FEWEST} rows that count, got {int(mine.sum())}; measure it more "
