@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from motion.servo import KEYS, write_log
 
 from ccnn_torch.motion import load_logs, nominal_of
-from ccnn_torch.motion.effects import motion_effects
+from ccnn_torch.motion.effects import Facts, motion_effects
+from ccnn_torch.motion.library import library_of
 from ccnn_torch.motion.search import _Pool
 from ccnn_torch.motion.setting import problem_of
+from ccnn_torch.motion.spec import Spec, nothing, started, without
 from ccnn_torch.motion.stretches import smooth_speed
 from ccnn_torch.motion.whiten import white_noise
 
@@ -30,6 +34,28 @@ def test_no_screen_leaves_an_effect_out_beside_one_other(tmp_path: Path) -> None
     fit = next(f for f in found.values() if f.settled and f.members)
     pool.fit([[fit.spec]], 3)
     assert found[fit.members] is fit
+
+
+def test_a_set_has_the_same_prior_by_any_path() -> None:
+    facts = Facts("rad", {"inertia": 0.01}, gain=2.0)
+    library = library_of(motion_effects(["delay", "servo_gain", "backlash"]), [facts])
+    delay, gain, play = range(3)
+
+    def after(*path: tuple[int, int] | int) -> Spec:
+        """Effects that come as one of their variants, and go."""
+        spec = nothing(library)
+        for step in path:
+            if isinstance(step, int):
+                spec = without(spec, spec.members.index(step))
+            else:
+                spec = started(spec, library.variants[step[0]][step[1]], 0)
+        return spec
+
+    straight, around = after((delay, 0), (play, 1)), after((play, 0), (gain, 2), (delay, 0), gain, play, (play, 1))
+    assert straight.members == around.members == (delay, play)
+    assert straight.log_prior == around.log_prior == -math.log(2)
+    assert straight.moved == around.moved and torch.equal(straight.theta, around.theta)
+    assert after((gain, 1), gain).log_prior == 0
 
 
 def test_speeds_are_slopes_of_parabolas_up_to_the_ends() -> None:
