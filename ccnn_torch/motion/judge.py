@@ -189,7 +189,8 @@ def least_unseen(
         rest = {*best.members} - {name}
         others = {min({*m} - rest): f for m, f in fits.items() if rest < {*m} and len(m) == len(members)}
         needed = (less := fits.get(tuple(sorted(rest)))) is None or less.left > most * best.left
-        as_little = (o for o, f in others.items() if needed and o != name and f.left <= most * best.left)
+        near = (o for o, f in others.items() if f.left <= most * best.left and f.rss <= most * best.rss)
+        as_little = (o for o in near if needed and o != name)
         own = [*dict.fromkeys((*like, *as_little))]
         least = min((o for o in own if o in others), key=lambda o: others[o].unseen, default=name)
         if least != name and most * others[least].unseen < best.unseen:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from motion.servo import KEYS, write_log
 
 from ccnn_torch.motion import load_logs, nominal_of
 from ccnn_torch.motion.effects import Facts, motion_effects
+from ccnn_torch.motion.judge import least_unseen
 from ccnn_torch.motion.library import library_of
 from ccnn_torch.motion.search import _Pool
 from ccnn_torch.motion.setting import problem_of
-from ccnn_torch.motion.spec import Spec, nothing, started, without
+from ccnn_torch.motion.spec import Fit, Spec, nothing, started, without
 from ccnn_torch.motion.stretches import smooth_speed
 from ccnn_torch.motion.whiten import white_noise
 
@@ -56,6 +58,23 @@ def test_a_set_has_the_same_prior_by_any_path() -> None:
     assert straight.log_prior == around.log_prior == -math.log(2)
     assert straight.moved == around.moved and torch.equal(straight.theta, around.theta)
     assert after((gain, 1), gain).log_prior == 0
+
+
+def test_alike_names_are_told_by_runs_that_were_not_fitted() -> None:
+    def fit(members: tuple[int, ...], left: float, unseen: float) -> Fit:
+        return Fit(*[None] * len(Fit._fields))._replace(  # type: ignore[arg-type]
+            spec=SimpleNamespace(members=members), left=left, rss=left, unseen=unseen
+        )
+
+    fits = {
+        own: fit(own, *rest) for own, rest in {(0,): (9, 9), (0, 1): (1, 5), (0, 2): (4, 2), (0, 3): (1, 5)}.items()
+    }
+    # The second leaves less of other runs; the third as little of these, whatever its prior.
+    assert least_unseen(fits, (0, 1), {0: (), 1: (2,)}) == (fits[0, 2], {0: (), 2: (1, 3)})
+    assert least_unseen(fits, (0, 1), {0: (), 1: ()}) == (fits[0, 1], {0: (), 1: (3,)})
+    # Of a name that is not needed nothing is told by what stands in its place.
+    idle = fits | {(0,): fit((0,), 1, 5)}
+    assert least_unseen(idle, (0, 1), {0: (), 1: ()}) == (fits[0, 1], {0: (), 1: ()})
 
 
 def test_speeds_are_slopes_of_parabolas_up_to_the_ends() -> None:
