@@ -58,19 +58,31 @@ def with_form_error(dictionary: Dictionary, best: FittedSet, floor: float, is_kn
     levels = [_at_level(dictionary, best, floor, level) for level in LEVELS]
     if not is_known:
         return levels
-    # Whether the forms are those of the textbook is to be seen where the noise is known: the best set leaves that, and
-    # no more.
     every, usual = _at_level(dictionary, best, floor, 0.0), levels[0]
     exact = _without_discrepancies(every)
     count = dictionary.grams.values
     left, other = (_mean_square(one.found[0], one.dictionary) * one.variance / floor for one in (exact, usual))
-    shown = math.log(usual.variance / floor) + other * floor / usual.variance - left
-    misfit = max(left - 1 - _SLIGHTLY * math.sqrt(2 / count), 0.0) * count / 2
-    # What no effect describes may leave the noise, too, and say it with less.
     beaten = every.found[0].log_posterior - exact.found[0].log_posterior
-    odds = _LOG_EXACT + _SEEN * shown / 2 - misfit - beaten
-    share = 1 / (1 + math.exp(min(-odds, 700.0)))
+    share = share_of_exact(left, other, usual.variance / floor, count, beaten)
     return [*(replace(one, weight=one.weight * (1 - share)) for one in levels), replace(exact, weight=share)]
+
+
+def share_of_exact(left: float, other: float, usual: float, count: float, beaten: float) -> float:
+    """Probability that all forms are those of the textbook.
+
+    That is to be seen where the noise is known: the best set leaves that, and no more.
+
+    Args:
+        left: mean square that the best set leaves where forms are exact, in units of that of the noise.
+        other: the same where they are not.
+        usual: variance of noise and form errors, in the same units.
+        count: how many values there are.
+        beaten: log odds of what no effect describes, which may leave the noise, too, and say it with less.
+    """
+    shown = math.log(usual) + other / usual - left
+    misfit = max(left - 1 - _SLIGHTLY * math.sqrt(2 / count), 0.0) * count / 2
+    odds = _LOG_EXACT + _SEEN * shown / 2 - misfit - beaten
+    return 1 / (1 + math.exp(min(-odds, 700.0)))
 
 
 def is_unexplained(dictionary: Dictionary, found: FittedSet, floor: float) -> bool:

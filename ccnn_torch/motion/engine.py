@@ -31,7 +31,7 @@ from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.setting import problem_of
-from ccnn_torch.motion.spec import Fit, renamed
+from ccnn_torch.motion.spec import Fit
 from ccnn_torch.motion.stretches import PHASES, Stretches, phases_of
 
 
@@ -123,7 +123,7 @@ def _diagnosed(
     library, data = problem.library, problem.data
     alone, names = singles(found), in_order(problem, judged)
     members = [library.names.index(name) for name in names]
-    steps = [[only(library, v.best.spec, members[:k]) for v in judged] for k in range(len(names) + 1)]
+    steps = [[only(v.best.spec, members[:k]) for v in judged] for k in range(len(names) + 1)]
     # Where an effect acts in one run alone the others do not tell its numbers.
     folded = replace(problem, parted=any(v.best.once > ALONE for v in judged))
     residuals = held_out(folded, found.whitening, [*steps, *alone.values()])
@@ -218,18 +218,18 @@ def _effects_of(
     library = problem.library
     named = {m for v in verdicts for m in v.best.members}
     # The fits that tell the numbers of each effect: of the verdict, or of the effect alone where none has it.
-    shown: list[tuple[int, int, Fit]] = []
+    shown: list[tuple[int, int, int, Fit]] = []
     for e in map(library.names.index, alone):
         tried = library.twins.get(e, e)
         for i, v in enumerate(verdicts):
             single = () if tried in named else (f for f in found.found[i] if f.members == (tried,))
             fit = v.best if tried in v.best.members else next(iter(single), None)
-            shown += [] if fit is None else [(e, i, fit._replace(spec=renamed(library, fit.spec, tried, e)))]
-    noises = [found.found[i][0].noise + found.form[i] for _, i, _ in shown]
+            shown += [] if fit is None else [(e, tried, i, fit)]
+    noises = [found.found[i][0].noise + found.form[i] for *_, i, _ in shown]
     spread = deviations([fit for *_, fit in shown], found.nuisance.shape[1], noises)
     parameters: dict[int, dict[str, Any]] = {}
-    for (e, i, fit), own in zip(shown, spread, strict=True):
-        parameters.setdefault(e, {}).update(_parameters(library, i, fit, e, own))
+    for (e, tried, i, fit), own in zip(shown, spread, strict=True):
+        parameters.setdefault(e, {}).update(_parameters(library, i, fit, e, tried, own))
     rows = []
     for name, gap in alone.items():
         e = library.names.index(name)
@@ -278,10 +278,12 @@ def _hidden_of(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
     """Cautions where nothing is named although a set leaves clearly less, a sentence each without a full stop."""
     names, shares = problem.library.names, {**problem.unsure, TIME: share_of(problem.known, TIME)}
     allowed = allowed_text(shares)
+    # Where each value was told no form of the model is allowed for beside them.
+    wanted = listed([key for key in problem.unsure if key not in problem.known] or ["the others"])
     return [
         f"q{i + 1} errs by more than the noise, most like {words_of(names[v.hidden]).cause}, but by less than the form "
-        f"of a model{f' and its values ({allowed})' * bool(allowed)} are known to: say with exact=… what is exact, or "
-        "record motions that show it more"
+        f"of a model{f' and its values ({allowed})' * bool(allowed)} are known to: say with exact=… or known=… "
+        f"how far to trust {wanted}, or record motions that show it more"
         for i, v in enumerate(verdicts)
         if v.hidden is not None
     ]
@@ -367,10 +369,13 @@ def _unit(unit: str, axis: Facts) -> tuple[str, float]:
     return known.get(unit, (unit, 1.0))
 
 
-def _parameters(library: Library, axis: int, fit: Fit, effect: int, deviation: Tensor) -> dict[str, dict[str, Any]]:
+def _parameters(
+    library: Library, axis: int, fit: Fit, effect: int, tried: int, deviation: Tensor
+) -> dict[str, dict[str, Any]]:
     """The numbers of one effect of a fit, as `parameters` of diagnosis.json; value: the difference to the model.
 
-    deviation: of the fit's numbers, in plausible sizes.
+    tried: the effect itself, or one that does the same and was fitted; deviation: of the fit's numbers, in plausible
+    sizes.
     """
     facts, theta, found = library.facts[axis], fit.spec.theta.tolist(), dict[str, dict[str, Any]]()
 
@@ -379,9 +384,9 @@ def _parameters(library: Library, axis: int, fit: Fit, effect: int, deviation: T
         size = {"value": value * factor, "sd": None if sd is None else sd * factor}
         found[f"q{axis + 1} {name}"] = {**size, "unit": unit, "part": f"joint {axis + 1}", **more}
 
-    flat = fit.spec.flat
-    for j in (j for j in library.places[effect] if j in flat):
-        number: Number = library.numbers[axis][j]
+    flat, variant = fit.spec.flat, next(v for v in fit.spec.variants if v.effect == tried)
+    for j in variant.active:
+        number: Number = library.numbers[axis][library.places[effect][library.places[tried].index(j)]]
         value, sd = theta[j] * number.scale, float(deviation[flat.index(j)]) * number.scale
         if number.inverse:
             value += facts.nominal.get(number.acts[0].parameter, 0.0)
@@ -391,8 +396,7 @@ def _parameters(library: Library, axis: int, fit: Fit, effect: int, deviation: T
         if all(act.how == "factor" for act in number.acts):
             sd, value = sd * math.exp(value), math.expm1(value)
         told(number.name, value, sd, number.unit, {} if number.model is None else {"nominal": number.model})
-    own = {place for variant in library.variants[effect] for place in variant.held}
     for name, place in library.held.items():
-        if place in own and theta[place]:
+        if place in variant.held and theta[place]:
             told(name, theta[place], None, _SHAPE_UNITS.get(name, "speed"), {})
     return found

@@ -10,7 +10,6 @@ from torch import Tensor
 from ccnn_torch.evidence.shrink import Draws, Gap, HeldOut, shrink_of
 from ccnn_torch.motion.descent import refitted
 from ccnn_torch.motion.judge import AxisVerdict
-from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.spec import Spec, nothing, without
@@ -54,10 +53,10 @@ def gap_of(problem: Problem, before: Tensor, after: Tensor, floor: float, known:
     return shrink_of(rows[0], held, torch.tensor([floor], dtype=per.dtype), torch.tensor([True]), dof, draws)
 
 
-def only(library: Library, spec: Spec, members: Sequence[int]) -> Spec:
+def only(spec: Spec, members: Sequence[int]) -> Spec:
     """The set with these members alone."""
     while extra := [k for k, m in enumerate(spec.members) if m not in members]:
-        spec = without(library, spec, extra[0])
+        spec = without(spec, extra[0])
     return spec
 
 
@@ -78,7 +77,7 @@ def in_order(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
     there = list(dict.fromkeys(m for v in verdicts for m in v.best.members))
     if not there:
         return []
-    specs = [only(problem.library, v.best.spec, [m for m in there if m != e]) for e in there for v in verdicts]
+    specs = [only(v.best.spec, [m for m in there if m != e]) for e in there for v in verdicts]
     left = problem.residual(torch.stack([s.theta for s in specs]), problem.axes.repeat(len(there)))
     size = (left.square() * problem.data.judged).sum((1, 2)).reshape(len(there), -1).sum(1)
     return [names[there[k]] for k in torch.argsort(size, descending=True).tolist()]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH
+from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH, share_of_exact
 from ccnn_torch.evidence.judge import judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams
 from ccnn_torch.motion.descent import sensitivities
@@ -50,6 +50,8 @@ _ENDS = (0.02, 0.98)
 _STEP, _SIZE = 1e-3, 0.05
 
 Members = tuple[int, ...]
+# Names, drivers, log posterior and set.
+Named = tuple[frozenset[int], tuple[str, ...], float, "Candidate"]
 
 
 class AxisVerdict(NamedTuple):
@@ -77,8 +79,9 @@ class AxisVerdict(NamedTuple):
 
 def judge_axes(found: Search) -> list[AxisVerdict]:
     """The verdict on each axis."""
-    drivers = driver_columns(found.problem, [fits[0].spec for fits in found.found])
-    verdicts = [_judged(found, i, drivers) for i in range(len(found.found))]
+    best = [fits[0].spec for fits in found.found]
+    drivers, above = driver_columns(found.problem, best), _above_white(found.problem, best)
+    verdicts = [_judged(found, i, drivers, above[i]) for i in range(len(found.found))]
     named = {m for v in verdicts for m in v.best.members}
     # What another joint shows clearly is not hidden.
     verdicts = [v._replace(hidden=None, doubted=False) if v.hidden in named else v for v in verdicts]
@@ -122,42 +125,84 @@ def no_worse(
     return verdicts, kept
 
 
-def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
+def _above_white(problem: Problem, specs: Sequence[Spec]) -> list[float]:
+    """Mean squares of what is left of each axis over those of white noise with the same differences from sample to
+    sample (von Neumann 1941): 1 where nothing but noise is left."""
+    left = problem.pooled(problem.residual(torch.stack([spec.theta for spec in specs]), problem.axes))
+    pairs = problem.judged[:, 1:] & problem.judged[:, :-1]
+    white = left.diff(dim=-1)[:, pairs].square().mean(-1) / 2
+    ratio: list[float] = (left[:, problem.judged].square().mean(-1) / white.clamp_min(1e-300)).tolist()
+    return ratio
+
+
+def _judged(found: Search, axis: int, drivers: Sequence[Driver], above: float) -> AxisVerdict:
     problem, fits = found.problem, found.found[axis]
     by_members = {f.members: f for f in fits}
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
     sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f)) for f in fits]
     sets += with_drivers(found, axis, drivers, by_members)
-    levels, twins, beside = [], problem.library.twins, found.nuisance.shape[1]
-    for level in LEVELS:
-        weights = _weights(sets, beside, fits[0].noise, level * found.form[axis], level * OF_SMOOTH)
-        named = [
+    twins, beside, noise = problem.library.twins, found.nuisance.shape[1], fits[0].noise
+
+    def named(level: float) -> list[Named]:
+        weights = _weights(sets, beside, noise, level * found.form[axis], level * OF_SMOOTH)
+        return [
             (names, one.drivers, w, one)
             for w, one in zip(weights, sets, strict=True)
             for names in names_of(one.members, twins)
         ]
-        levels.append((1 / len(LEVELS), named))
-    explanations = posterior(levels)
+
+    # What an effect makes of the logs has no form error where white noise is all that is left.
+    every = named(0.0)
+    exact = [one for one in every if not one[1]]
+    beaten = max(w for *_, w, _ in every) - max(w for *_, w, _ in exact)
+    share = share_of_exact(above, above, 1 + found.form[axis] / noise, problem.values, beaten)
+    explanations = posterior([(share, exact), *(((1 - share) / len(LEVELS), named(level)) for level in LEVELS)])
     verdict = judge(explanations, explanations, of_classes=True)
-    best, hidden, doubted = by_members[verdict.chosen.best.members], None, False
+    best, classes = least_unseen(by_members, verdict.chosen.best.members, verdict.classes)
+    hidden, doubted = None, False
     probability = verdict.probability
     if verdict.outside and not holds(problem, verdict.chosen.best, beside):
         probability = min(probability, _UNCONFIRMED)
     most = _CLEARLY**2 * fits[0].rss
     if not best.members and not verdict.outside and best.rss > most:
-        hidden = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left).members[0]
-        doubted = _after_nuisance(best, fits[0].noise) > most
+        # Not what a value that is known no better explains as well.
+        alone = (f for f in fits if len(f.members) == 1)
+        hidden = min(alone, key=lambda f: _after_nuisance(f, noise)).members[0]
+        doubted = _after_nuisance(best, noise) > most
     marginals = {e: marginal(explanations, e) for e in {*(e for f in fits for e in f.members), *twins}}
     driver = verdict.drivers[0] if verdict.outside else None
-    return AxisVerdict(best, probability, marginals, verdict.classes, driver, hidden, doubted)
+    return AxisVerdict(best, probability, marginals, classes, driver, hidden, doubted)
 
 
-def _after_nuisance(nothing: Fit, noise: float) -> float:
-    """Squares that are left of nothing where nominal values and time stamps are off as far as is likely."""
-    xx, xy = nothing.grams.xx, nothing.grams.xy
+def least_unseen(
+    fits: Mapping[Members, Fit], members: Members, classes: Mapping[int, tuple[int, ...]]
+) -> tuple[Fit, Mapping[int, tuple[int, ...]]]:
+    """The fit of a verdict, each of its names being the one of its class that leaves clearly least of runs that it was
+    not fitted to, and their classes: what priors and form errors do not tell apart other runs may.
+
+    Of a class is also what leaves as little in the place of a name that is needed, whatever the prior is.
+    """
+    best, told, most = fits[members], dict[int, tuple[int, ...]](), _NEARLY**2
+    for name, like in classes.items():
+        rest = {*best.members} - {name}
+        others = {min({*m} - rest): f for m, f in fits.items() if rest < {*m} and len(m) == len(members)}
+        needed = (less := fits.get(tuple(sorted(rest)))) is None or less.left > most * best.left
+        near = (o for o, f in others.items() if f.left <= most * best.left and f.rss <= most * best.rss)
+        as_little = (o for o in near if needed and o != name)
+        own = [*dict.fromkeys((*like, *as_little))]
+        least = min((o for o in own if o in others), key=lambda o: others[o].unseen, default=name)
+        if least != name and most * others[least].unseen < best.unseen:
+            best, name, own = others[least], least, [name, *(o for o in own if o != least)]
+        told[name] = tuple(own)
+    return best, told
+
+
+def _after_nuisance(fit: Fit, noise: float) -> float:
+    """Squares that a set leaves, its numbers being plausible, and nominal values and time stamps off as is likely."""
+    xx, xy = fit.grams.xx, fit.grams.xy
     inner = xx + noise * torch.eye(len(xx), dtype=xx.dtype)
-    return float(nothing.grams.yy - xy @ torch.linalg.solve(inner, xy))
+    return float(fit.grams.yy - xy @ torch.linalg.solve(inner, xy))
 
 
 def _weights(sets: Sequence[Candidate], nuisance: int, noise: float, form: float, smooth: float) -> list[float]:

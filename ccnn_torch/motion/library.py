@@ -52,6 +52,7 @@ class Variant(NamedTuple):
         held: places in the vector of shapes that are held at a value.
         shapes: those values, `n x len(held)`.
         log_prior: log of the share of the effect's prior that it has.
+        free: places in the vector of shapes that a fit refines from there.
     """
 
     effect: int
@@ -60,10 +61,7 @@ class Variant(NamedTuple):
     held: tuple[int, ...]
     shapes: Tensor
     log_prior: float
-
-    def free(self, held: dict[str, int]) -> tuple[int, ...]:
-        """Places of the shapes that a fit refines."""
-        return tuple(place for name, place in held.items() if name in _REFINED and place in self.held)
+    free: tuple[int, ...]
 
 
 class Library(NamedTuple):
@@ -246,6 +244,7 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
             tuple(held[name] for name in own),
             torch.tensor([[given[name] for name in own] for given in of_axes], dtype=torch.float64),
             -math.log(count) + _RARER.get(effects[e].name, 0.0),
+            tuple(held[name] for name in own if name in _REFINED),
         )
 
     same: dict[Any, int] = {}

@@ -99,9 +99,8 @@ def _settled(
 def _own_spec(problem: Problem) -> Spec:
     """All of the simulator's parameters, and nothing else."""
     library = problem.library
-    members = tuple(e for e, name in enumerate(library.names) if name.startswith(PARAMETER))
-    theta = torch.zeros(library.size, dtype=torch.float64)
-    return Spec(members, theta, tuple(library.places[e] for e in members), 0.0)
+    own = (v[0] for name, v in zip(library.names, library.variants, strict=True) if name.startswith(PARAMETER))
+    return Spec(torch.zeros(library.size, dtype=torch.float64), tuple(own))
 
 
 def _best(found: Search) -> list[Spec]:

@@ -257,7 +257,7 @@ class _Pool:
             now = [f.spec if on else nothing(self.library) for f, on in zip(before, going, strict=True)]
             self.fit(self.screened(self.fewer(now, _SHORT)), _SHORT)
             # What does the same as a member needs the numbers that the others have beside that.
-            pairs = [(i, without(self.library, s, k)) for i, s in enumerate(now) for k in range(len(s.members))]
+            pairs = [(i, without(s, k)) for i, s in enumerate(now) for k in range(len(s.members))]
             less = fit_many(self.problem, self.whitening, pairs, 0, nuisance=self.nuisance)
             bases = [[fit for (j, _), fit in zip(pairs, less, strict=True) if j == i] for i in range(self.axes)]
             self.fit(self.screened(bases, 1, [{f.members} for f in before]), _SHORT)
@@ -272,7 +272,7 @@ class _Pool:
         for i, ranked in enumerate(self.ranked()):
             twins = [t for f in ranked[:_KEPT] if (t := with_gain(self.library, i, f.spec)) is not None]
             # Friction that was too large by as much as the inertia is none beside the gain.
-            wanted.append([*twins, *(without(self.library, t, k) for t in twins for k in range(len(t.members)))])
+            wanted.append([*twins, *(without(t, k) for t in twins for k in range(len(t.members)))])
         self.fit(wanted, _LONG)
 
     def reduced(self) -> None:
@@ -284,7 +284,7 @@ class _Pool:
 
     def fewer(self, sets: Sequence[Spec], steps: int) -> list[list[Fit]]:
         """The set of each axis without each of its members, fitted anew: it may have been tried from farther away."""
-        less = [[without(self.library, s, k) for k in range(len(s.members))] for s in sets]
+        less = [[without(s, k) for k in range(len(s.members))] for s in sets]
         self.fit(less, steps)
         return [[self.found[i][s.members] for s in own] for i, own in enumerate(less)]
 
@@ -306,18 +306,14 @@ class _Pool:
         for (i, fit), found in zip(pairs, promised, strict=True):
             if not fit.members:
                 # Alone an effect is tried from wherever it may begin: limits are far from linear.
-                more = [
-                    started(self.library, fit.spec, v, i)
-                    for _, v in found
-                    if len(self.library.variants[v.effect]) <= _STARTS
-                ]
+                more = [started(fit.spec, v, i) for _, v in found if len(self.library.variants[v.effect]) <= _STARTS]
                 wanted[i] |= {(*spec.members, k): spec for k, spec in enumerate(more)}
             scores: dict[int, tuple[float, Variant]] = {}
             for score, variant in found:
                 if variant.effect not in scores or _level(score) > _level(scores[variant.effect][0]):
                     scores[variant.effect] = (score, variant)
             ranked = (v for _, v in sorted(scores.values(), key=lambda item: (-_level(item[0]), item[1].effect)))
-            specs = (started(self.library, fit.spec, variant, i) for variant in ranked)
+            specs = (started(fit.spec, variant, i) for variant in ranked)
             new = (spec for spec in specs if spec.members not in old[i])
             for spec in islice(new, most):
                 wanted[i].setdefault(spec.members, spec)
@@ -338,7 +334,7 @@ def with_gain(library: Library, axis: int, spec: Spec) -> Spec | None:
     variant = next(v for v in library.variants[gain] if of_axis[v.active[0]].acts[0].how == "factor")
     if times <= 0:
         return None
-    other = started(library, without(library, spec, spec.members.index(inertia)), variant, axis)
+    other = started(without(spec, spec.members.index(inertia)), variant, axis)
     other.theta[variant.active[0]] = -math.log(times) / of_axis[variant.active[0]].scale
     for j in other.flat:
         name, factor, how = of_axis[j].acts[0]

@@ -15,32 +15,38 @@ class Spec(NamedTuple):
     """A set of effects of one axis, and where its fit begins.
 
     Attributes:
-        members: effects, ascending.
         theta: all numbers, `k`; those of other effects 0.
-        active: places that are fitted, effect by effect.
-        log_prior: of the variants.
-        free: places of shapes that are refined beside them; what they cost is in the variants' prior.
+        variants: of each effect the one that is fitted, effects ascending.
     """
 
-    members: tuple[int, ...]
     theta: Tensor
-    active: tuple[tuple[int, ...], ...]
-    log_prior: float
-    free: tuple[int, ...] = ()
+    variants: tuple[Variant, ...]
+
+    @property
+    def members(self) -> tuple[int, ...]:
+        """Its effects."""
+        return tuple(v.effect for v in self.variants)
+
+    @property
+    def log_prior(self) -> float:
+        """Of the variants."""
+        return sum(v.log_prior for v in self.variants)
 
     @property
     def moved(self) -> tuple[int, ...]:
-        return (*self.flat, *self.free)
+        """Places that a fit moves: of numbers, and of shapes, which it refines; what these cost is in the prior."""
+        return (*self.flat, *(j for v in self.variants for j in v.free))
 
     @property
     def flat(self) -> tuple[int, ...]:
-        return tuple(j for group in self.active for j in group)
+        """Places of numbers that are fitted, effect by effect."""
+        return tuple(j for v in self.variants for j in v.active)
 
     @property
     def groups(self) -> list[Tensor]:
         """Columns of each effect among those of `flat`."""
         places = iter(range(len(self.flat)))
-        return [torch.tensor([next(places) for _ in group]) for group in self.active]
+        return [torch.tensor([next(places) for _ in v.active]) for v in self.variants]
 
 
 class Fit(NamedTuple):
@@ -77,48 +83,20 @@ class Fit(NamedTuple):
 
 def nothing(library: Library) -> Spec:
     """The set without any effect."""
-    return Spec((), torch.zeros(library.size, dtype=torch.float64), (), 0.0)
+    return Spec(torch.zeros(library.size, dtype=torch.float64), ())
 
 
-def started(library: Library, spec: Spec, variant: Variant, axis: int) -> Spec:
+def started(spec: Spec, variant: Variant, axis: int) -> Spec:
     """The set with one effect more, which begins as its variant says."""
     theta = spec.theta.clone()
     theta[list(variant.active)] = variant.values[axis]
     if variant.held:
         theta[list(variant.held)] = variant.shapes[axis]
-    both = sorted([*zip(spec.members, spec.active, strict=True), (variant.effect, variant.active)])
-    return Spec(
-        tuple(m for m, _ in both),
-        theta,
-        tuple(a for _, a in both),
-        spec.log_prior + variant.log_prior,
-        (*spec.free, *variant.free(library.held)),
-    )
+    return Spec(theta, tuple(sorted((*spec.variants, variant), key=lambda v: v.effect)))
 
 
-def without(library: Library, spec: Spec, place: int) -> Spec:
+def without(spec: Spec, place: int) -> Spec:
     """The set without one of its members."""
-    theta, effect = spec.theta.clone(), spec.members[place]
-    rest = [k for k in range(len(spec.members)) if k != place]
-    held = {p for v in library.variants[effect] for p in v.held}
-    theta[[*spec.active[place], *held]] = 0.0
-    return Spec(
-        tuple(spec.members[k] for k in rest),
-        theta,
-        tuple(spec.active[k] for k in rest),
-        spec.log_prior,
-        tuple(p for p in spec.free if p not in held),
-    )
-
-
-def renamed(library: Library, spec: Spec, effect: int, other: int) -> Spec:
-    """The set with another effect, of the same numbers, in the place of one."""
-    to = dict(zip(library.places[effect], library.places[other], strict=True))
-    theta = spec.theta.clone()
-    theta[[*to]] = 0.0
-    theta[[*to.values()]] = spec.theta[[*to]]
-    return spec._replace(
-        members=tuple(other if m == effect else m for m in spec.members),
-        theta=theta,
-        active=tuple(tuple(to.get(j, j) for j in group) for group in spec.active),
-    )
+    theta, variant = spec.theta.clone(), spec.variants[place]
+    theta[[*variant.active, *variant.held]] = 0.0
+    return Spec(theta, (*spec.variants[:place], *spec.variants[place + 1 :]))

@@ -233,7 +233,7 @@ def test_another_gain_is_another_inertia_and_friction() -> None:
     for name, value in {"inertia": 0.006, "viscous": 0.02, "coulomb": 0.03}.items():
         theta[numbers[name]] = value / library.numbers[0][numbers[name]].scale
     own = [library.names.index(name) for name in ("inertia", "viscous", "coulomb")]
-    spec = Spec(tuple(sorted(own)), theta, tuple((library.places[e][0],) for e in sorted(own)), 0.0)
+    spec = Spec(theta, tuple(library.variants[e][0] for e in sorted(own)))
     other = with_gain(library, 0, spec)
     assert other is not None and {library.names[m] for m in other.members} == {"servo_gain", "viscous", "coulomb"}
     sets = [library.parameters(one.theta[None], torch.tensor([0])) for one in (spec, other)]
@@ -242,4 +242,4 @@ def test_another_gain_is_another_inertia_and_friction() -> None:
     assert a == pytest.approx(b, abs=1e-9)
     for without in (["inertia", "viscous"], ["servo_gain", "viscous"]):
         few = library_of(motion_effects(without), [facts])
-        assert with_gain(few, 0, Spec((1,), torch.ones(few.size, dtype=torch.float64), ((0,),), 0.0)) is None
+        assert with_gain(few, 0, Spec(torch.ones(few.size, dtype=torch.float64), few.variants[1][:1])) is None

@@ -149,7 +149,8 @@ def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: 
     real = {"dry": 0.1, "delay": 0.03, "weight": 0.3}
     log, out = write_log(tmp_path / "log.csv", (0, 1), 2.4, **real), tmp_path / "out"
     keys = "{gain: 2.0, inertia: 0.004, viscous: 0.09}"
-    effects = "delay,coulomb,gravity"
+    # Another share of the command is nearly the same, and less improbable before other runs tell.
+    effects = "delay,coulomb,gravity,joint_gain"
     given = ("--motion", log, "--mechanism", "servo", "--effects", effects, "--out", out, f"mechanism_keys={keys}")
     code, said, error = cli("diagnose", *given)
     assert code == 0 and not error and "ccnn compensate" in said
@@ -189,14 +190,22 @@ def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: 
 
 
 def test_what_is_less_than_models_are_known_to_is_not_said_to_be_noise(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, dry=0.0024)
-    nominal = nominal_of("servo", KEYS, ["rad"])
-    found = diagnose_motion(load_logs([log]), nominal, ["delay", "coulomb"]).content
+    def wavering(time: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        return moved(time, asked, dry=0.0028) + 1e-4 * np.sin(3 * time)
+
+    nominal, tried = nominal_of("servo", KEYS, ["rad"]), ["delay", "coulomb"]
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, wavering)
+    found = diagnose_motion(load_logs([log]), nominal, tried).content
     assert found["verdict"]["none"] and found["verdict"]["probability"] <= 0.5
     allowed = "(gain 3 %, inertia 3 %, viscous 3 %, time 10 % of a step)"
     assert (
         f"most like dry friction, but by less than the form of a model and its values {allowed}" in found["cautions"][0]
     )
+    assert "how far to trust gain, inertia and viscous" in found["cautions"][0]
+    # A model beside which friction leaves white noise has the right form.
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, dry=0.0028)
+    found = diagnose_motion(load_logs([log]), nominal, tried).content
+    assert found["verdict"]["effects"] == ["coulomb"] and found["verdict"]["probability"] > 0.95
 
 
 def test_of_a_model_whose_values_are_exact_little_friction_is_named(tmp_path: Path, cli: Cli) -> None:

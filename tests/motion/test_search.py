@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +12,12 @@ import torch
 from motion.servo import KEYS, write_log
 
 from ccnn_torch.motion import load_logs, nominal_of
-from ccnn_torch.motion.effects import motion_effects
+from ccnn_torch.motion.effects import Facts, motion_effects
+from ccnn_torch.motion.judge import least_unseen
+from ccnn_torch.motion.library import library_of
 from ccnn_torch.motion.search import _Pool, log_posterior, prior_of
 from ccnn_torch.motion.setting import problem_of
-from ccnn_torch.motion.spec import Fit, Spec
+from ccnn_torch.motion.spec import Fit, Spec, nothing, started, without
 from ccnn_torch.motion.stretches import smooth_speed
 from ccnn_torch.motion.whiten import white_noise
 
@@ -36,8 +40,8 @@ def test_no_screen_leaves_an_effect_out_beside_one_other(tmp_path: Path) -> None
 
 def fit_of(count: int, evidence: float) -> Fit:
     """A set of so many effects whose model says so much."""
-    spec, nothing = Spec(tuple(range(count)), torch.zeros(0), (), 0.0), torch.zeros(0)
-    return Fit(spec, evidence, 1.0, nothing, 0.0, 0.0, 0.0, 0.0, None, True)  # type: ignore[arg-type]
+    spec = SimpleNamespace(members=tuple(range(count)), log_prior=0.0)
+    return Fit(*[None] * len(Fit._fields))._replace(spec=spec, log_evidence=evidence)  # type: ignore[arg-type]
 
 
 def test_an_effect_must_be_ten_times_as_likely_and_something_outside_a_thousand_times() -> None:
@@ -45,6 +49,45 @@ def test_an_effect_must_be_ten_times_as_likely_and_something_outside_a_thousand_
     assert log_posterior(fit_of(1, 2.2)) < none < log_posterior(fit_of(1, 2.4))
     assert log_posterior(fit_of(3, 9.1)) < none < log_posterior(fit_of(3, 9.3))
     assert 6.8 + prior_of(fit_of(0, 0.0), drivers=1) < none < 7.0 + prior_of(fit_of(0, 0.0), drivers=1)
+
+
+def test_a_set_has_the_same_prior_by_any_path() -> None:
+    facts = Facts("rad", {"inertia": 0.01}, gain=2.0)
+    library = library_of(motion_effects(["delay", "servo_gain", "backlash"]), [facts])
+    delay, gain, play = range(3)
+
+    def after(*path: tuple[int, int] | int) -> Spec:
+        """Effects that come as one of their variants, and go."""
+        spec = nothing(library)
+        for step in path:
+            if isinstance(step, int):
+                spec = without(spec, spec.members.index(step))
+            else:
+                spec = started(spec, library.variants[step[0]][step[1]], 0)
+        return spec
+
+    straight, around = after((delay, 0), (play, 1)), after((play, 0), (gain, 2), (delay, 0), gain, play, (play, 1))
+    assert straight.members == around.members == (delay, play)
+    assert straight.log_prior == around.log_prior == -math.log(2)
+    assert straight.moved == around.moved and torch.equal(straight.theta, around.theta)
+    assert after((gain, 1), gain).log_prior == 0
+
+
+def test_alike_names_are_told_by_runs_that_were_not_fitted() -> None:
+    def fit(members: tuple[int, ...], left: float, unseen: float) -> Fit:
+        return Fit(*[None] * len(Fit._fields))._replace(  # type: ignore[arg-type]
+            spec=SimpleNamespace(members=members), left=left, rss=left, unseen=unseen
+        )
+
+    fits = {
+        own: fit(own, *rest) for own, rest in {(0,): (9, 9), (0, 1): (1, 5), (0, 2): (4, 2), (0, 3): (1, 5)}.items()
+    }
+    # The second leaves less of other runs; the third as little of these, whatever its prior.
+    assert least_unseen(fits, (0, 1), {0: (), 1: (2,)}) == (fits[0, 2], {0: (), 2: (1, 3)})
+    assert least_unseen(fits, (0, 1), {0: (), 1: ()}) == (fits[0, 1], {0: (), 1: (3,)})
+    # Of a name that is not needed nothing is told by what stands in its place.
+    idle = fits | {(0,): fit((0,), 1, 5)}
+    assert least_unseen(idle, (0, 1), {0: (), 1: ()}) == (fits[0, 1], {0: (), 1: ()})
 
 
 def test_speeds_are_slopes_of_parabolas_up_to_the_ends() -> None:
