@@ -351,7 +351,8 @@ def maps(
     bar.set_label(f"{quantity} [{unit}]")
     bar.outline.set_visible(False)
     if isinstance(norm, LogNorm):
-        _log_ticks(bar.ax.yaxis, norm.vmax / norm.vmin)
+        low, high = bar.ax.get_ylim()
+        _log_ticks(bar.ax.yaxis, high / low)
     return figure, f"RMS {number_text(_rms(before) / scale, 3)} → {number_text(_rms(after) / scale, 3)} {unit}"
 
 
