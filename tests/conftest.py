@@ -21,14 +21,18 @@ from matplotlib.figure import Figure
 from ccnn_torch.cli import main
 
 torch.set_num_threads(1)
+# Rewriting the tests' asserts is 10 s of each worker, compiling the package half a second of each process that tests
+# start: both are kept for the next, whatever the environment says.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# 700 new objects, Python's own threshold, are made by one operation on tensors, and by a line of a test that is read.
+gc.set_threshold(50_000, 10, 10)
 
 
 def pytest_collection_finish() -> None:
     """What the imports left is there to stay: the garbage collector need not look at it again and again."""
     gc.collect()
     gc.freeze()
-    # And rarely at what is new: 700 new objects, Python's own threshold, are made by one operation on tensors.
-    gc.set_threshold(50_000, 10, 10)
 
 
 @pytest.fixture(autouse=True, scope="module")

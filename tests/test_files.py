@@ -130,7 +130,7 @@ def test_curves_end_where_the_disk_is_full_and_the_run_goes_on(tmp_path: Path) -
     assert 0 < len(steps) < 39 and steps == list(range(1, len(steps) + 1))
     (tmp_path / "file").write_text("")
     events = EventFile(tmp_path / "file" / "t")
-    events.add_scalar("a", 1.0, 1)
+    events.add_scalars({"a": 1.0}, 1)
     events.close()
     assert events.failed == "Not a directory"
 

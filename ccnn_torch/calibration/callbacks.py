@@ -83,9 +83,8 @@ class TensorBoardCallback:
             self._origin -= _seconds(metrics) or 0.0
         seconds = _seconds(metrics)
         if step % self._every == 0 or step == 1:
-            for name, value in metrics.items():
-                for tag, number in tags_of(name, value).items():
-                    self._writer.add_scalar(tag, number, step, walltime=self._walltime(seconds))
+            tags = (tags_of(name, value) for name, value in metrics.items())
+            self._writer.add_scalars({tag: n for own in tags for tag, n in own.items()}, step, self._walltime(seconds))
         if self._masks is not None and (step % _MASKS_EVERY == 0 or step == 1):
             for layer, mask in enumerate(self._masks(), start=1):
                 picture = np.kron(np.asarray(mask, dtype=np.uint8), np.ones((_CELL, _CELL), dtype=np.uint8)) * 255
@@ -160,11 +159,10 @@ class EventFile:
             purge_step: TensorBoard ignores the records of older files of this folder from this step on.
         """
         # Only runs that write curves should pay for the import; torch's own `summary` costs more than all of these.
-        from tensorboard.compat.proto import event_pb2, summary_pb2
+        from tensorboard.compat.proto import event_pb2
         from tensorboard.summary.writer.record_writer import RecordWriter
 
         self._event: Any = event_pb2.Event
-        self._summary: Any = summary_pb2.Summary
         self.failed: str | None = None
         # TensorBoard reads the files of a folder in the order of their names, and two may begin within a second.
         seconds, rest = divmod(time.time_ns(), 1_000_000_000)
@@ -180,20 +178,19 @@ class EventFile:
             self._add(None, step=purge_step, file_version="brain.Event:2")
             self._add(None, step=purge_step, session_log={"status": event_pb2.SessionLog.START})
 
-    def add_scalar(self, tag: str, number: float, step: int, walltime: float | None = None) -> None:
-        self._add_value(step, walltime, tag=tag, simple_value=number)
+    def add_scalars(self, numbers: Mapping[str, float], step: int, walltime: float | None = None) -> None:
+        """In one record: its checksum and its frame take longer than a number."""
+        self._add(walltime, step=step, summary={"value": [{"tag": t, "simple_value": n} for t, n in numbers.items()]})
 
     def add_image(self, tag: str, png: bytes, step: int) -> None:
         """png: content of a PNG file, whose header has the size."""
         width, height = struct.unpack(">II", png[16:24])
-        self._add_value(step, tag=tag, image={"width": width, "height": height, "encoded_image_string": png})
+        image = {"width": width, "height": height, "encoded_image_string": png}
+        self._add(None, step=step, summary={"value": [{"tag": tag, "image": image}]})
 
     def close(self) -> None:
         if self.failed is None:
             self._records.close()
-
-    def _add_value(self, step: int, walltime: float | None = None, **content: Any) -> None:
-        self._add(walltime, step=step, summary=self._summary(value=[self._summary.Value(**content)]))
 
     def _add(self, walltime: float | None, **content: Any) -> None:
         event = self._event(wall_time=time.time() if walltime is None else walltime, **content)

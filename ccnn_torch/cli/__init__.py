@@ -4,6 +4,7 @@ Exit codes: 0 done, 2 bad input (one sentence on stderr), 130 interrupted, 1 a b
 also ends with 1 where a promise is not kept.
 """
 
+import gc
 import os
 import signal
 import sys
@@ -11,10 +12,13 @@ from contextlib import suppress
 from types import FrameType
 
 _IMPORT = "<frozen importlib"
+_OBJECTS = 100_000
+"""New objects after which cycles are looked for. The 700 of Python make it search the 200,000 of the imports often."""
 
 
 def main() -> None:
     """Entry point of the console script: Ctrl-C ends it with one line from its first import on."""
+    gc.set_threshold(_OBJECTS, 20, 100)
     # An ignored signal (nohup) stays ignored, and only the main thread sets a handler.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         with suppress(ValueError):

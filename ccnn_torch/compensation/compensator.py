@@ -158,7 +158,7 @@ class Compensator(nn.Module):
     def learned(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Guarded and limited part that was learned, at *commanded* joints, `... x n` [SI]; as `forward`."""
         learned, known = self._learned(joints, covariates)
-        return known * learned.value
+        return torch.where(known, learned.value, 0.0)
 
     def sd(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Standard deviation of a newly measured δ at *commanded* joints, model and noise, `... x n` [SI].
@@ -166,7 +166,7 @@ class Compensator(nn.Module):
         Finite for every input; arguments and errors as `forward`.
         """
         learned, known = self._learned(joints, covariates)
-        return torch.where(known > 0, self.sd_of(learned.weight, learned.features), self.fallback_sd)
+        return torch.where(known, self.sd_of(learned.weight, learned.features), self.fallback_sd)
 
     def sd_of(self, weight: Tensor, features: Tensor) -> Tensor:
         """`sd` where the guard's weight, `... x 1` [1], and the network's features, `... x i` [1], are known."""
@@ -256,10 +256,10 @@ class Compensator(nn.Module):
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
 
     def _learned(self, joints: Tensor, covariates: Tensor | None) -> tuple[Learned, Tensor]:
-        """What was learned at commanded joints, and 1 where all inputs were finite, else 0, `... x 1`."""
+        """What was learned at commanded joints, and whether all inputs were finite, `... x 1`."""
         functions = Functions(self)
         found = functions.clean(self._inputs(joints, covariates))
-        return functions.learned(found["q"], found["x"]), found["known"]
+        return functions.learned(found["q"], found["x"]), found["strange"] < 1
 
     def _inputs(self, joints: Tensor, covariates: Tensor | None) -> Tensor:
         """Joints and covariates side by side, `... x (n + m)` [SI]."""

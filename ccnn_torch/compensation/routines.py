@@ -203,7 +203,7 @@ def status_of(strange: Tensor, inside: Tensor, doubt: Tensor | None = None) -> T
     if doubt is not None:
         # Written so that what is no number is not exact.
         found = torch.where(doubt <= 0, found, DAMPED)
-    return torch.where(strange <= 0, found, NOT_FINITE)
+    return torch.where(strange < 1, found, NOT_FINITE)
 
 
 class Learned(NamedTuple):
@@ -225,7 +225,7 @@ class Functions:
 
     Every function takes variables as parameters of their names and gives others. Variables: `inputs` as given; `ideal`
     and `x` joints and covariates made finite, `q` those joints as they are looked at; `strange`, how many inputs were
-    not finite, and `known`, 1 where all were, else 0; `start`, the first correction; `aim` of a machine; `correction`
+    not finite; `start`, the first correction; `aim` of a machine; `correction`
     tried, `found` to try next, `doubt` above 0 where `correction` is not the exact one; the guard's `excess`, above 0
     outside the domain, its `weight` and the network's `features`; `first` and `near…`, `found` and the others of the
     first step; `steps` of Broyden's method, with `next` and `done` to follow.
@@ -263,15 +263,17 @@ class Functions:
         return blank[..., :0]
 
     def clean(self, inputs: Tensor) -> Variables:
-        n, own, domain = self.joints, self.own, self.own.domain
-        finite, strange = domain.clean(inputs)
-        at = finite
-        if self.caged_once:
-            room = torch.cat([own.limit, own.limit.new_zeros(len(own.covariates))])
-            at = torch.minimum(torch.maximum(finite, domain._cage_low - room), domain._cage_high + room)
-        known = 1 - torch.clamp(strange, 0.0, 1.0)
-        found = {"ideal": finite[..., :n], "q": at[..., :n], "x": at[..., n:], "strange": strange, "known": known}
+        n, own = self.joints, self.own
+        finite, strange = own.domain.clean(inputs)
+        at = self.in_reach(finite) if self.caged_once else finite
+        found = {"ideal": finite[..., :n], "q": at[..., :n], "x": at[..., n:], "strange": strange}
         return found | {"start": own.safe.expand_as(found["q"])}
+
+    def in_reach(self, inputs: Tensor) -> Tensor:
+        """Inputs `... x d` [SI], kept where some correction leads to a place at which the guard has not ended."""
+        own, domain = self.own, self.own.domain
+        room = torch.cat([own.limit, own.limit.new_zeros(len(own.covariates))])
+        return torch.minimum(torch.maximum(inputs, domain._cage_low - room), domain._cage_high + room)
 
     def excess(self, caged: Tensor) -> Tensor:
         """How far beyond the margin, `... x 1` [1]."""
@@ -340,29 +342,28 @@ class Functions:
         self,
         ideal: Tensor,
         strange: Tensor,
-        known: Tensor,
         correction: Tensor,
         excess: Tensor,
         weight: Tensor,
         doubt: Tensor,
     ) -> Variables:
-        inside, correction, weight = excess + strange <= 0, known * correction, known * weight
+        inside = excess + strange <= 0
+        correction, weight = (torch.where(strange < 1, v, 0.0) for v in (correction, weight))
         return {
             "command": ideal - correction,
             "deviation": correction,
             "inside_domain": inside.squeeze(-1),
             "guard": weight,
-            "status": self.status(strange, inside, doubt).squeeze(-1),
+            "status": status_of(strange, inside, doubt).squeeze(-1),
         }
 
     def sure(self, strange: Tensor, weight: Tensor, features: Tensor) -> Variables:
-        return {"deviation_sd": torch.where(strange <= 0, self.own.sd_of(weight, features), self.own.fallback_sd)}
+        return {"deviation_sd": torch.where(strange < 1, self.own.sd_of(weight, features), self.own.fallback_sd)}
 
     def choose(
         self,
         ideal: Tensor,
         strange: Tensor,
-        known: Tensor,
         first: Tensor,
         near: Tensor,
         near_weight: Tensor,
@@ -376,33 +377,32 @@ class Functions:
         good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
         both = zip((correction, excess, weight, features), (first, near, near_weight, near_features), strict=True)
         taken, excess, weight, features = (torch.where(good, *pair) for pair in both)
-        found = self.finish(ideal, strange, known, taken, excess, weight, doubt)
+        found = self.finish(ideal, strange, taken, excess, weight, doubt)
         return found | {"weight": weight, "features": features}
 
     def finish_back(
         self,
         ideal: Tensor,
         strange: Tensor,
-        known: Tensor,
         found: Tensor,
         excess: Tensor,
         weight: Tensor,
         doubt: Tensor,
     ) -> Variables:
-        inside, found, weight = excess + strange <= 0, known * found, known * weight
+        inside = excess + strange <= 0
+        found, weight = (torch.where(strange < 1, v, 0.0) for v in (found, weight))
         return {
             "ideal": ideal + found,
             "back_deviation": found,
             "ideal_inside_domain": inside.squeeze(-1),
             "back_guard": weight,
-            "ideal_status": self.status(strange, inside, doubt).squeeze(-1),
+            "ideal_status": status_of(strange, inside, doubt).squeeze(-1),
         }
 
     def choose_back(
         self,
         ideal: Tensor,
         strange: Tensor,
-        known: Tensor,
         first: Tensor,
         correction: Tensor,
         excess: Tensor,
@@ -410,11 +410,7 @@ class Functions:
         doubt: Tensor,
     ) -> Variables:
         good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
-        return self.finish_back(ideal, strange, known, -torch.where(good, correction, first), excess, weight, doubt)
-
-    def status(self, strange: Tensor, inside: Tensor, doubt: Tensor) -> Tensor:
-        """See `status_of`."""
-        return status_of(strange, inside, doubt)
+        return self.finish_back(ideal, strange, -torch.where(good, correction, first), excess, weight, doubt)
 
     def _doubt(self, wanted: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
         """Whether a correction is damped, at a bound or on its way, `... x 1`: above 0."""
@@ -451,7 +447,7 @@ class ControllerFunctions(Functions):
     def spread(self, q: Tensor, x: Tensor, strange: Tensor) -> Variables:
         learned = self.learned(q, x)
         sd = self.own.sd_of(learned.weight, learned.features)
-        good = torch.logical_and(sd >= 0, sd < torch.inf).all(-1, keepdim=True) & (strange <= 0)
+        good = torch.logical_and(sd >= 0, sd < torch.inf).all(-1, keepdim=True) & (strange < 1)
         state = status_of(strange, good & (learned.excess <= 0))
         return {"sd": torch.where(good, sd, self.own.fallback_sd), "status": state}
 
@@ -462,7 +458,7 @@ class ControllerFunctions(Functions):
         rounding = self.slack + self.eps * (q.abs() + found.abs())
         # Written so that what is no number is not good.
         right = ((command + found - q).abs() <= rounding).all(-1, keepdim=True)
-        good = right & self.own.is_allowed(found) & (strange <= 0)
+        good = right & self.own.is_allowed(found) & (strange < 1)
         state = status_of(strange, good & (excess <= 0))
         return {
             "command": torch.where(good, command, q),
@@ -473,7 +469,7 @@ class ControllerFunctions(Functions):
     def finish_back(  # type: ignore[override]
         self, q: Tensor, strange: Tensor, found: Tensor, excess: Tensor
     ) -> Variables:
-        good = self.own.is_allowed(found) & (strange <= 0)
+        good = self.own.is_allowed(found) & (strange < 1)
         return {"joints": torch.where(good, q + found, q), "status": status_of(strange, good & (excess <= 0))}
 
     def choose(  # type: ignore[override]
@@ -487,7 +483,7 @@ class ControllerFunctions(Functions):
         doubt: Tensor,
     ) -> Variables:
         good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
-        deviation = torch.where(strange <= 0, torch.where(good, correction, first), 0.0)
+        deviation = torch.where(strange < 1, torch.where(good, correction, first), 0.0)
         state = status_of(strange, torch.where(good, excess, near) <= 0, doubt)
         return {"command": q - deviation, "deviation": deviation, "status": state}
 

@@ -16,11 +16,12 @@ from typing import Any, ParamSpec, TypeVar
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter, LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from ccnn_torch.coordinates import Coordinate
@@ -158,6 +159,8 @@ def bare(axes: Axes) -> None:
 
 
 Array = NDArray[np.float64]
+_MANY_DECADES = 1e3
+"""Ratio above which a logarithmic axis has one label a decade; more would touch each other."""
 _FAINT_UP_TO = 200
 """Rows above which the training rows are left out: they would hide the held-out ones."""
 
@@ -264,9 +267,7 @@ def _draw_distribution(axes: Axes, title: str, si_unit: str, errors: Mapping[str
     least = min(float(v[v > 0].min()) if (v > 0).any() else np.inf for v in errors.values())
     if np.isfinite(least) and errors["before"].max() / least > 10:
         axes.set_xscale("log")
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        # Set as formulas labels take a tenth of the time of a report.
-        axes.xaxis.set_minor_formatter(LogFormatter())
+        _log_ticks(axes.xaxis, errors["before"].max() / least)
     axes.set_title(title.capitalize())
     axes.set_xlabel(f"{title} [{unit}]")
     axes.set_ylabel("share of rows [%]")
@@ -350,10 +351,16 @@ def maps(
     bar.set_label(f"{quantity} [{unit}]")
     bar.outline.set_visible(False)
     if isinstance(norm, LogNorm):
-        bar.ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        bar.ax.yaxis.set_minor_locator(NullLocator())
+        low, high = bar.ax.get_ylim()
+        _log_ticks(bar.ax.yaxis, high / low)
     return figure, f"RMS {number_text(_rms(before) / scale, 3)} → {number_text(_rms(after) / scale, 3)} {unit}"
+
+
+def _log_ticks(axis: Axis, ratio: float) -> None:
+    """Few ticks with plain numbers on a logarithmic axis whose ends have this ratio; minor ones take most of a plot."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if ratio < _MANY_DECADES else (1,)))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_locator(NullLocator())
 
 
 def _norm(before: Array, after: Array) -> Normalize:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
+from onnx import compose, helper
 from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKernel
 from torch import Tensor
 from torch.fx import GraphModule
@@ -23,14 +24,11 @@ from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
 from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, OUTPUTS, check_graph, open_onnx, run_onnx
 from ccnn_torch.compensation.routines import (
-    EXACT,
     KEPT,
-    NOT_FINITE,
-    OUTSIDE,
     Functions,
+    Variables,
     execute,
     routines_of,
-    status_of,
 )
 from ccnn_torch.compensation.targets.golden import Golden, probe_points
 from ccnn_torch.compensation.targets.lowering import recorded
@@ -55,6 +53,10 @@ def rows_apart_from(module: torch.nn.Module) -> int:
     return next(p for p in primes if all(n % p for n in lengths))
 
 
+# Those of a command alone, which have a short way where the guard is 1.
+_OF_COMMAND = frozenset({"command", "deviation", "inside_domain", "status"})
+# Of the limit: how far a correction moves joints, and what is rounded on the way.
+_REACH = 1.01
 # In the graph their numbers are there, so that command + deviation is the joints to the last digit.
 _SOLID = frozenset({"ideal", "correction", "found"})
 
@@ -62,11 +64,14 @@ _SOLID = frozenset({"ideal", "correction", "found"})
 class GraphFunctions(Functions):
     """Those of a graph, in which every operation costs as much as a matrix product: fewer of them."""
 
-    def status(self, strange: Tensor, inside: Tensor, doubt: Tensor) -> Tensor:
-        if self.own.machine is not None:
-            return status_of(strange, inside, doubt)
-        # What is not finite is not inside either. Sums cost less than choices.
-        return torch.where(inside, EXACT, OUTSIDE) + torch.where(strange <= 0, EXACT, NOT_FINITE - OUTSIDE)
+    def __init__(self, own: Compensator) -> None:
+        super().__init__(own)
+        reach = float(own.limit.max())
+        self.ends = float(own.domain._cage_low.min()) - reach, float(own.domain._cage_high.max()) + reach
+
+    def in_reach(self, inputs: Tensor) -> Tensor:
+        # Farther out they are finite, too, and one operation has one limit for all.
+        return torch.clamp(inputs, *self.ends)
 
     def excess(self, caged: Tensor) -> Tensor:
         domain = self.own.domain
@@ -82,11 +87,31 @@ class GraphFunctions(Functions):
         both = weight * torch.clamp(torch.cat([raw / unit, torch.ones_like(weight)], -1), -1.0, 1.0)
         return both[..., : self.joints] * limit - both[..., self.joints :] * safe + safe
 
+    def surely_inside(self, inputs: Tensor) -> Tensor:
+        """Whether every correction leaves all rows of `inputs` `s x (n + m)` [SI] inside the domain, 0-dim."""
+        domain = self.own.domain
+        reach = _REACH * self.own.limit @ domain._axes[: self.joints].abs()
+        away = (inputs - domain.centre) @ domain._axes - domain.middle
+        # What is no number is not inside.
+        return (torch.cat([away, -away], -1) <= (domain.radius - reach).repeat(2)).all()
+
+
+class InsideFunctions(GraphFunctions):
+    """Those of rows that are `surely_inside`: the guard's weight is 1, and all inputs are finite."""
+
+    def clean(self, inputs: Tensor) -> Variables:
+        n, none = self.joints, torch.zeros_like(inputs[..., :1])
+        found = {"ideal": inputs[..., :n], "q": inputs[..., :n], "x": inputs[..., n:]}
+        return found | {"strange": none, "start": self.own.safe.expand_as(found["q"])}
+
+    def excess(self, caged: Tensor) -> Tensor:
+        return torch.zeros_like(caged[..., :1])
+
 
 def command_graph(
     compensator: Compensator, opset: int, metadata: str, outputs: Sequence[str], dtype: str = "float64"
 ) -> onnx.ModelProto:
-    """Both directions as one graph.
+    """Both directions as one graph; the command alone has a branch for rows that are all `surely_inside`.
 
     Args:
         outputs: which ones, in order: those of `Solution`, or `deviation`, `guard`, `back_deviation`, `back_guard`.
@@ -95,8 +120,51 @@ def command_graph(
     Raises:
         MethodFailedError: the model has an operation that no file has.
     """
+    functions = GraphFunctions(compensator)
+    model = _graph(functions, opset, outputs, dtype)
+    if functions.caged_once and {*outputs} <= _OF_COMMAND:
+        inside = _graph(InsideFunctions(compensator), opset, outputs, dtype)
+        model = _branched(functions, inside.graph, model)
+    model.metadata_props.add(key=METADATA_KEY, value=metadata)
+    return model
+
+
+def _branched(functions: GraphFunctions, inside: onnx.GraphProto, model: onnx.ModelProto) -> onnx.ModelProto:
+    """One graph of two with the same outputs: `inside` where all rows are `surely_inside`, else that of the model."""
+    graph, given = _begun(functions, model.opset_import[0].version, "float64")
+    example = torch.zeros(given.shape, dtype=torch.float64)
+    (sure,) = ByTensors(graph).run(recorded(functions.surely_inside, [example]), [given])
+    found = graph.model({"surely_inside": sure}, "batch", "compensator")
+    branches = {
+        f"{name}_branch": compose.add_prefix_graph(own, f"{name}_", rename_inputs=False)
+        for name, own in (("then", inside), ("else", model.graph))
+    }
+    for branch in branches.values():
+        del branch.input[:]
+    del found.graph.output[:]
+    found.graph.output.extend(model.graph.output)
+    found.graph.node.append(helper.make_node("If", ["surely_inside"], [o.name for o in model.graph.output], **branches))
+    return found
+
+
+def _begun(functions: GraphFunctions, opset: int, dtype: str) -> tuple[Graph, Value]:
+    """A graph with its inputs, and these side by side, `s x (n + m)`."""
+    compensator = functions.own
     n, m = len(compensator.joints), len(compensator.covariates)
-    rows, functions = rows_apart_from(compensator), GraphFunctions(compensator)
+    graph, batch = Graph(rows_apart_from(compensator), opset, dtype), 1 if dtype == "float32" else "batch"
+    given = graph.input("joints", n, batch)
+    if m:
+        # No linear form: an infinite number times 0 would be none.
+        names, shape = [given.name, graph.input("covariates", m, batch).name], (graph.rows, n + m)
+        given = graph.node("Concat", names, shape, shape, axis=1)
+    return graph, given
+
+
+def _graph(functions: GraphFunctions, opset: int, outputs: Sequence[str], dtype: str) -> onnx.ModelProto:
+    """As `command_graph`, without branches and metadata."""
+    compensator = functions.own
+    graph, given = _begun(functions, opset, dtype)
+    n, rows = len(compensator.joints), graph.rows
     examples = functions.start(compensator.domain.centre.repeat(rows, 1))
     sd = "deviation_sd" in outputs
     routines = routines_of(compensator, KEPT, sd, ("sure",) if sd else ())
@@ -104,13 +172,6 @@ def command_graph(
         for routine in routines:
             functions.run(routine.statements, examples)
     nothing = examples["aim"][:, :0]
-    batch: str | int = 1 if dtype == "float32" else "batch"
-    graph = Graph(rows, opset, dtype)
-    given = graph.input("joints", n, batch)
-    if m:
-        # No linear form: an infinite number times 0 would be none.
-        names = [given.name, graph.input("covariates", m, batch).name]
-        given = graph.node("Concat", names, (rows, n + m), (rows, n + m), axis=1)
     lowering = ByTensors(graph)
     known: dict[tuple[str, int], tuple[GraphModule, list[str]]] = {}
 
@@ -136,9 +197,7 @@ def command_graph(
     found: dict[str, Any] = {"inputs": given, "aim": nothing}
     for routine in routines:
         execute(routine.statements, found, call, zeros)
-    model = graph.model({name: found[name] for name in outputs}, batch, "compensator")
-    model.metadata_props.add(key=METADATA_KEY, value=metadata)
-    return model
+    return graph.model({name: found[name] for name in outputs}, 1 if dtype == "float32" else "batch", "compensator")
 
 
 def export_onnx(compensator: Compensator, metadata: str, outputs: Sequence[str] = OUTPUTS) -> bytes:
@@ -155,8 +214,9 @@ def export_onnx(compensator: Compensator, metadata: str, outputs: Sequence[str] 
         MethodFailedError: the file does not give the eager model's numbers, see `verify`, or cannot be run.
     """
     model = command_graph(compensator, _OPSET, metadata, outputs)
-    # What is read back must not be refused.
-    check_graph(model)
+    if {*outputs} >= {*OUTPUTS}:
+        # What is read back must not be refused; a controller's file is not, and has branches.
+        check_graph(model)
     content: bytes = model.SerializeToString(deterministic=True)
     try:
         session = open_onnx(content)
@@ -229,8 +289,9 @@ def verify(compensator: Compensator, run: Any, form: str, outputs: Sequence[str]
     share = min(compensator.export_tolerance, _LOOSEST)
     wanted = {name: value.numpy() for name, value in expected.items()}
     vectors = Golden(given[0], joints.numpy()[:, :0], wanted, share * compensator.most.numpy(), share)
-    for rows in (len(joints), 1):
-        found = run(*(None if v is None else v[:rows] for v in given))
+    parts = [run(*(None if v is None else v[k : k + 1] for v in given)) for k in range(len(joints))]
+    alone = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    for found in (run(*given), alone):
         wrong = [name for name, error in vectors.errors(found, outputs).items() if not error <= 1]
         if wrong:
             raise MethodFailedError(

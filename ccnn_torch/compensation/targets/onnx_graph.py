@@ -84,8 +84,8 @@ class Graph:
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
             self._constants[key] = numpy_helper.from_array(array, f"c{len(self._constants)}")
-            if array.dtype.kind == "i":
-                self._integers.add(self._constants[key].name)
+            if array.dtype.kind in "ib":
+                (self._integers if array.dtype.kind == "i" else self._truths).add(self._constants[key].name)
         return str(self._constants[key].name)
 
     def node(
@@ -284,11 +284,15 @@ class Graph:
             if times > 1:
                 part = self.node("Mul", [batch, self.constant(np.array([times], np.int64))], (1,), (1,)).name
             parts.append(part if times else self.constant(np.array([n], np.int64)))
-        return self.node("Concat", parts, (len(shape),), (len(shape),), axis=0).name
+        return parts[0] if len(parts) == 1 else self.node("Concat", parts, (len(shape),), (len(shape),), axis=0).name
 
 
 _TRUTHS = frozenset({"Less", "LessOrEqual", "Greater", "GreaterOrEqual", "Equal", "And", "Or", "Not"})
-_MOVES = frozenset({"Squeeze", "Unsqueeze", "Reshape", "Slice", "Gather", "Expand", "Identity", "Transpose", "Concat"})
+# Whose result is of the type of the first input.
+_MOVES = frozenset({
+    "Squeeze", "Unsqueeze", "Reshape", "Slice", "Gather", "Expand", "Identity", "Transpose", "Concat", "ReduceMin",
+    "ReduceMax",
+})  # fmt: skip
 _WHOLE = _MOVES | {"Where", "Add"}
 
 

@@ -61,9 +61,6 @@ class ByTensors(Lowering):
 
     def reduced(self, op: str, value: Value, dims: list[int], keep: bool) -> Value:
         graph = self.graph
-        if op in ("and", "or"):
-            found = self.reduced("min" if op == "and" else "max", self.each("select", value, 1.0, 0.0), dims, keep)
-            return self._node("Greater", found, 0.5)
         solid, axes = graph.full(value), sorted(dims)
         shape = [1 if k in axes else n for k, n in enumerate(solid.shape) if keep or k not in axes]
         if op == "add" or graph.opset >= 18:
