@@ -21,6 +21,7 @@ from ccnn_torch.simulation.job import simulate_records
 Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent
 ARM = Path(__file__).parent / "effects" / "arm.yaml"
+GANTRY = ROOT / "tests" / "effects" / "gantry.yaml"
 
 
 def words(mechanism: str | Path, *more: str | Path | int) -> tuple[str | Path, ...]:
@@ -98,9 +99,9 @@ def test_every_effect_can_be_drawn_in_a_plausible_size(effect: str) -> None:
 
 
 def _seen_by(effect: str) -> Mechanism:
-    """The arm, or a mount of two axes for the one effect that is of directions."""
+    """The arm, a gantry for what is of guides, or a mount of two axes for what is of directions."""
     if effect != "flexure":
-        return load_mechanism(str(ARM))
+        return load_mechanism(str(GANTRY if effect == "error_motion" else ARM))
     links = [[0.0, math.pi / 2, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]
     return load_mechanism("serial", name="mount", convention="standard", links=links, orientation="direction")
 

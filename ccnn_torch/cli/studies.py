@@ -181,15 +181,15 @@ def simulate(
 ) -> None:
     """Simulate the records of a machine that differs from its model by given effects, and print what was injected.
 
-    OUT.csv has the commanded joints, the measured pose and the conditions (time, temperature, loads, directions of
-    approach; speeds along moves). Effects: geometry, joint_offset, joint_gain, transmission, backlash, friction,
-    compliance, thermal_compliance, sag (with columns of torques), gravity, bending (an arm), thermal, drift,
-    homing (on four days), frame, frame_drift, tool, coupling, latency, flexure (of directions: key
-    orientation=direction of an arm), instrument, outlier (bad rows), or your own as path/to/file.py:Name. An
-    effect without parameters is drawn in a plausible size; size=2 makes that twice as large. Given parameters are
-    SI numbers or have a unit (q1=0.1mm); blanks in names may be underscores; parameters that are not given are 0.
-    Keys: mechanism_keys, covariates, rows, duration, step, move, way, load, moment, gravity, max_condition,
-    rotation_weight.
+    OUT.csv has the commanded joints, the measured pose and the conditions (time, temperature, loads,
+    directions of approach; speeds along moves). Effects: geometry, joint_offset, joint_gain, transmission,
+    backlash, friction, compliance, thermal_compliance, sag (with columns of torques), gravity, bending (an
+    arm), thermal, drift, homing (on four days), frame, frame_drift, tool, coupling, error_motion (joints that
+    slide), latency, flexure (of directions: key orientation=direction of an arm), instrument, outlier (bad
+    rows), or your own as path/to/file.py:Name. An effect without parameters is drawn in a plausible size;
+    size=2 makes that twice as large. Given parameters are SI numbers or have a unit (q1=0.1mm); blanks in
+    names may be underscores; parameters that are not given are 0. Keys: mechanism_keys, covariates, rows,
+    duration, step, move, way, load, moment, gravity, max_condition, rotation_weight.
 
     Examples:
 
