@@ -82,7 +82,7 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, 
     if details is not None and not quiet:
         run_page(calibration.results, folder=folder.path).show(stdout, details)
         place = typed_path(str(folder.path))
-        say_place(f"Everything is in {place}; open {place}/report.html")
+        say_place(f"Everything is in {place}" + (f"; open {place}/report.html" if config.save_report else ""))
 
 
 RUN = FolderJob("ccnn run", RunConfig, "results.json", "checkpoints/*.safetensors", _prepared, _run)

@@ -58,7 +58,7 @@ class ErrorMotion(Effect):
         values = arm.resolve(situation.whole.parameters)
         base, frames = rotation_vector_to_matrix(values[..., 3:6]), arm.link_frames(situation.joints, values)
         low, high = arm.limits.unbind(-1)
-        travel = ((2 * situation.joints - low - high) / (high - low)).clamp(-1, 1)[..., None]
+        travel = ((2 * situation.joints - low - high) / (high - low).clamp_min(1e-9)).clamp(-1, 1)[..., None]
         forms = torch.cat([travel**k for k in range(len(_LEGENDRE) + 1)], -1) @ travel.new_tensor(_LEGENDRE).mT
         parts = []
         for i in _sliding(situation):

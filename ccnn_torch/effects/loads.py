@@ -247,8 +247,8 @@ class Gravity(Effect):
     the measured point of the platform. c is compliance times weight: a sag for each metre of lever (turning joints), or
     along a joint that carries all (sliding ones). Secondary: a joint that stiffens, d τ|τ| / 0.3 m (or / 1); what
     another mass distribution does: for an arm a weight at the tool, and one that is larger towards the base; for a
-    turning drive of another machine its crank, whose weight acts in proportion to cos q and sin q, and for a platform
-    that turns the moment of its weight about the measured point, in its own axes, on drives of plausible compliance.
+    revolute drive of another machine the weight of its crank, a torque in proportion to cos q and sin q, and for a
+    platform that turns the moment of its weight about the measured point, in its axes, on drives of plausible give.
     """
 
     name = "gravity"

@@ -17,13 +17,7 @@ from scipy.signal import lsim
 
 from ccnn_torch.diagnosis.verdict.findings import findings
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion import (
-    diagnose_motion,
-    load_identified,
-    load_logs,
-    nominal_of,
-    write_identified,
-)
+from ccnn_torch.motion import diagnose_motion, load_identified, load_logs, nominal_of, write_identified
 from ccnn_torch.motion.effects import motion_effects
 from ccnn_torch.motion.judge import judge_axes, no_worse
 from ccnn_torch.motion.search import search

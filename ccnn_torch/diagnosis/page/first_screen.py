@@ -104,7 +104,7 @@ def _wrong(results: Block) -> str:
     verdict, open_ = results["verdict"], undetermined(results)
     found = [f.text for f in findings(results)]
     if len(joints := results.get("joints", [])) > 1 and verdict["effects"]:
-        # Numbers, and what cannot be told from what, are in the table.
+        # Numbers, and names that the data do not distinguish, are in the table.
         each = [(one, ", ".join(words_of(e).short for e in one["effects"])) for one in joints]
         named = [(_joint(one["joint"]), one.get("word"), names) for one, names in each if names]
         found = [f"{joint} ({word}): {names}" if word else f"{joint}: {names}" for joint, word, names in named]
@@ -370,7 +370,7 @@ def joints_table(results: Block) -> Table | None:
         name = f"{name} {own.get('word', '')}".strip()
         rows.append((name, what, ", ".join(said) or "–", sure, removed, "; ".join(rest) or "–"))
     columns = ("joint", "what is wrong", "number", "how sure", "gap", "or, and what is left")
-    note = "Probability of each joint's names, those that cannot be told apart taken as one; gaps are of runs held out."
+    note = "Probability of each joint's names, indistinguishable ones taken as one; gaps are of runs held out."
     return Table("Each joint", columns, rows, note)
 
 

@@ -85,7 +85,7 @@ class Coefficient(Result):
     shown: str = ""
     """the unit that they tell it in"""
     searched: bool = False
-    """whether it is a period, a time constant or the like, for which values were tried: not to be told from 0"""
+    """whether it is a period, a time constant or the like, for which values were tried: no test against 0 exists"""
     about: About | None = None
     """of a gain: the joint that it multiplies, and the command of it from which it counts [SI]"""
 
