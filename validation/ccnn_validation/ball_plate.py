@@ -10,7 +10,6 @@ other places over the table at other angles, in the frame and with the tool that
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -21,8 +20,7 @@ from scipy.spatial.transform import Rotation
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from ccnn_validation.delivered.product import Contestant
-from ccnn_validation.delivered.tables import read_commands
+from ccnn_validation.drawn import commanded, judge_machines
 
 Array = NDArray[np.float64]
 # Balls on the table and the probe's tip below the spindle [m]; of a probed coordinate [m]; places judged.
@@ -149,18 +147,9 @@ def inputs(joints: Array) -> Array:
 def by_package(joints: Array, places: Array, targets: Array, folder: Path) -> dict[str, Array | None]:
     """Commands to ideal joints by the files of `ccnn run` and of `ccnn identify`."""
     names = "q1[rad],q2[rad],q3[m],q4[m],q5[m]"
-    np.savetxt(folder / "rows.csv", np.c_[joints, places], "%.12g", ",", header=f"{names},x[m],y[m],z[m]", comments="")
-    np.savetxt(folder / "targets.csv", targets, "%.12g", ",", header=names, comments="")
-    (folder / "trunnion.yaml").write_text(MACHINE)
-    (folder / "config.yaml").write_text("records: rows.csv\nmechanism: trunnion.yaml\n")
-    found: dict[str, Array | None] = {}
-    for command, file in (("run", "model.safetensors"), ("identify", "identified.yaml")):
-        contestant = Contestant(folder, command)
-        contestant.call(command, "config.yaml", f"out={command}")
-        contestant.call("compensate", f"{command}/{file}", "targets.csv", f"{command}.csv")
-        path = folder / f"{command}.csv"
-        found[f"ours, {command}"] = read_commands(path, 5).joints if path.is_file() else None
-    return found
+    records = f"{names},x[m],y[m],z[m]", np.c_[joints, places]
+    ways = ("run", "identify")
+    return {f"ours, {way}": commanded(folder, MACHINE, records, (names, targets), way) for way in ways}
 
 
 def judged(seed: int, rows: int) -> dict[str, float]:
@@ -186,19 +175,5 @@ def judged(seed: int, rows: int) -> dict[str, float]:
     return found
 
 
-def main() -> None:
-    """Judge machines, the seeds counted from `--seed`."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--seed", type=int, required=True)
-    options.add_argument("--machines", type=int, default=4)
-    options.add_argument("--rows", type=int, default=120)
-    given = options.parse_args()
-    found = {f"trunnion {seed}": judged(seed, given.rows) for seed in range(given.seed, given.seed + given.machines)}
-    every = list(found.values())
-    found["median"] = {who: float(np.median([one[who] for one in every])) for who in every[0]}
-    for name, one in found.items():
-        print(f"{name} [µm]: " + "   ".join(f"{who} {1e6 * value:.2f}" for who, value in one.items()))
-
-
 if __name__ == "__main__":
-    main()
+    judge_machines(__doc__, judged, 120)

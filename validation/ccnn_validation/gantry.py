@@ -9,7 +9,6 @@ random places not measured, in the frame that suits what each one's commands rea
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -22,8 +21,7 @@ from scipy.spatial.transform import Rotation
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from ccnn_validation.delivered.product import Contestant
-from ccnn_validation.delivered.tables import read_commands
+from ccnn_validation.drawn import commanded, judge_machines
 
 Array = NDArray[np.float64]
 Map = Callable[[Array], Array]
@@ -116,15 +114,7 @@ SCRIPTS = {"polynomials": by_polynomials, "21 functions": by_functions, "scikit-
 def by_package(joints: Array, places: Array, targets: Array, folder: Path) -> Array | None:
     """Commands to ideal joints by the written file."""
     names = "q1[m],q2[m],q3[m]"
-    np.savetxt(folder / "rows.csv", np.c_[joints, places], "%.12g", ",", header=f"{names},x[m],y[m],z[m]", comments="")
-    np.savetxt(folder / "targets.csv", targets, "%.12g", ",", header=names, comments="")
-    (folder / "gantry.yaml").write_text(MACHINE)
-    (folder / "config.yaml").write_text("records: rows.csv\nmechanism: gantry.yaml\n")
-    contestant = Contestant(folder, "run")
-    contestant.call("run", "config.yaml", "out=model", "save_report=false")
-    contestant.call("compensate", "model/model.safetensors", "targets.csv", "commands.csv")
-    path = folder / "commands.csv"
-    return read_commands(path, 3).joints if path.is_file() else None
+    return commanded(folder, MACHINE, (f"{names},x[m],y[m],z[m]", np.c_[joints, places]), (names, targets))
 
 
 def judged(seed: int, rows: int) -> dict[str, float]:
@@ -148,19 +138,5 @@ def judged(seed: int, rows: int) -> dict[str, float]:
     return found
 
 
-def main() -> None:
-    """Judge machines, the seeds counted from `--seed`."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--seed", type=int, required=True)
-    options.add_argument("--machines", type=int, default=4)
-    options.add_argument("--rows", type=int, default=250)
-    given = options.parse_args()
-    found = [judged(seed, given.rows) for seed in range(given.seed, given.seed + given.machines)]
-    for seed, one in enumerate(found, given.seed):
-        print(f"gantry {seed} [µm]: " + "   ".join(f"{who} {1e6 * value:.1f}" for who, value in one.items()))
-    middle = {who: float(np.median([one[who] for one in found])) for who in found[0]}
-    print("median [µm]: " + "   ".join(f"{who} {1e6 * value:.1f}" for who, value in middle.items()))
-
-
 if __name__ == "__main__":
-    main()
+    judge_machines(__doc__, judged, 250)

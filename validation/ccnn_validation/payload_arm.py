@@ -8,7 +8,6 @@ are other places under 3 and 9 kg, and under 15 kg, in the frame and at the tool
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from ccnn_validation.delivered.product import Contestant
-from ccnn_validation.delivered.tables import read_commands
+from ccnn_validation.drawn import commanded, judge_machines
 
 Array = NDArray[np.float64]
 # Of the drawing, a row a joint: a [m], alpha [rad], d [m], theta, lean about y [rad]; the reflector on the flange [m].
@@ -161,16 +159,8 @@ def by_process(joints: Array, payload: Array, places: Array) -> list[GaussianPro
 def by_package(joints: Array, payload: Array, places: Array, wanted: Array, after: Array, folder: Path) -> Array | None:
     """Commands to the joints wanted, by the written file."""
     names = ",".join([*(f"q{k}[rad]" for k in range(1, 7)), "load_z[N]"])
-    table, targets, header = np.c_[joints, -G * payload, places], np.c_[wanted, -G * after], f"{names},x[m],y[m],z[m]"
-    np.savetxt(folder / "rows.csv", table, "%.10g", ",", header=header, comments="")
-    np.savetxt(folder / "targets.csv", targets, "%.10g", ",", header=names, comments="")
-    (folder / "arm.yaml").write_text(FILE)
-    (folder / "config.yaml").write_text("records: rows.csv\nmechanism: arm.yaml\n")
-    contestant = Contestant(folder, "run")
-    contestant.call("run", "config.yaml", "out=model", "save_report=false")
-    contestant.call("compensate", "model/model.safetensors", "targets.csv", "commands.csv")
-    path = folder / "commands.csv"
-    return read_commands(path, 6).joints if path.is_file() else None
+    records = f"{names},x[m],y[m],z[m]", np.c_[joints, -G * payload, places]
+    return commanded(folder, FILE, records, (names, np.c_[wanted, -G * after]))
 
 
 def judged(seed: int, rows: int) -> dict[str, float]:
@@ -199,19 +189,5 @@ def judged(seed: int, rows: int) -> dict[str, float]:
     return found
 
 
-def main() -> None:
-    """Judge arms, the seeds counted from `--seed`."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--seed", type=int, required=True)
-    options.add_argument("--machines", type=int, default=4)
-    options.add_argument("--rows", type=int, default=100)
-    given = options.parse_args()
-    found = {f"arm {seed}": judged(seed, given.rows) for seed in range(given.seed, given.seed + given.machines)}
-    every = list(found.values())
-    found["median"] = {who: float(np.median([one[who] for one in every])) for who in every[0]}
-    for name, one in found.items():
-        print(f"{name} [µm]: " + "   ".join(f"{who} {1e6 * value:.1f}" for who, value in one.items()))
-
-
 if __name__ == "__main__":
-    main()
+    judge_machines(__doc__, judged, 100)
