@@ -240,6 +240,7 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
             "load them with the mechanism that was measured"
         )
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
+    mechanism = mechanism.with_leans() if isinstance(mechanism, SerialArm) else mechanism
     parameters = fit_unknown(mechanism, records.joints, records.pose, columns=records.columns)
     if isinstance(mechanism, SerialArm) and parameters is not None:
         try:

@@ -207,19 +207,11 @@ class Geometry(Effect):
         """One a parameter."""
         mechanism = situation.mechanism
         chosen = caused_by(mechanism, self.name)
-        # The parameters of an arm's link i come after its joint i; those with words of their own need no link.
-        of_links = isinstance(inside(mechanism), SerialArm) and self.name == "geometry"
-        linked = of_links and not any(mechanism.geometry[k].word for k in chosen)
-        links = len(chosen) // len(mechanism.joints) if linked else 0
+        arm = inside(mechanism)
+        joint_of = arm.joint_of if isinstance(arm, SerialArm) else {}
         return tuple(
-            Coefficient(
-                mechanism.geometry[k].name,
-                mechanism.geometry[k].unit,
-                plausible_error(mechanism.geometry[k]),
-                joint=mechanism.joints[place // links].name if links else None,
-                leg=mechanism.geometry[k].leg,
-            )
-            for place, k in enumerate(chosen)
+            Coefficient(p.name, p.unit, plausible_error(p), joint=joint_of.get(p.name), leg=p.leg)
+            for p in (mechanism.geometry[k] for k in chosen)
         )
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:

@@ -33,7 +33,8 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     """Read a serial arm; keys that this does not know are ignored.
 
     Needed: `dof`, `convention` (starts with one of the two known), `units: {length, angle}`, `a`, `alpha`, `d`,
-    `theta`. Optional: `joint_types` (revolute), `joint_sign` (+1), `parallel_axes`, `base_frame` and `tool_frame`
+    `theta`. Optional: `beta` (leans of the links, see `SerialArm.leans`; 0), `joint_types` (revolute), `joint_sign`
+    (+1), `parallel_axes`, `base_frame` and `tool_frame`
     (a text with "unknown", "identity", or [x, y, z, rx, ry, rz]; unknown when missing), `tool_offset` (likewise, but
     [x, y, z]; replaces the tool frame for records without orientation), `goal_tool` (the frame that commanded poses are
     of, where it is not the measured one), `frame_per`, `tool_per`, `robot` (its name).
@@ -83,6 +84,7 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
         parallel_axes=table.groups("parallel_axes", n),
         orientation=orientation,
         goal_tool=goal,
+        leans=[[i, v * angle] for i, v in enumerate(table.numbers("beta", n, default=[0.0] * n), 1) if v],
     )
 
 

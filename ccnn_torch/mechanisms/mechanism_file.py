@@ -112,9 +112,12 @@ def mechanism_text(
     return dump_yaml(tree, width=120)
 
 
+_STANDARD = "standard Denavit-Hartenberg; link i = Rz(q_i + theta_i) * Tz(d_i) * Tx(a_i) * Rx(alpha_i)"
+_MODIFIED = "Rx(alpha_i) * Tx(a_i) * Rz(q_i + theta_i) * Tz(d_i)"
+# As they stand in the file, without and with leans.
 _CONVENTIONS = {
-    "standard": "standard Denavit-Hartenberg; link i = Rz(q_i + theta_i) * Tz(d_i) * Tx(a_i) * Rx(alpha_i)",
-    "modified": "modified Denavit-Hartenberg (Craig); link i = Rx(alpha_i) * Tx(a_i) * Rz(q_i + theta_i) * Tz(d_i)",
+    "standard": (_STANDARD, f"{_STANDARD} * Ry(beta_i)"),
+    "modified": tuple(f"modified Denavit-Hartenberg (Craig); link i = {by}{_MODIFIED}" for by in ("", "Ry(beta_i) * ")),
 }
 
 
@@ -126,15 +129,16 @@ def dh_text(arm: SerialArm) -> str:
     if arm.convention not in _CONVENTIONS:
         raise InputError(f"arm '{arm.name}' is described by a URDF and has no Denavit-Hartenberg table; write a URDF")
     values = arm.nominal.tolist()
-    links = arm.nominal[6:-6].reshape(len(arm.joints), -1).T.tolist()
+    links = arm.links(arm.nominal).T.tolist()
     tree: dict[str, Any] = {
         "robot": visible(arm.name),
         "dof": len(arm.joints),
-        "convention": _CONVENTIONS[arm.convention],
+        "convention": _CONVENTIONS[arm.convention][bool(arm.leans)],
         "units": {"length": "m", "angle": "rad"},
         "joint_types": ["revolute" if r else "prismatic" for r in arm.revolute.tolist()],
         "joint_sign": arm.signs.tolist(),
         **dict(zip(("a", "alpha", "d", "theta"), links, strict=True)),
+        **({"beta": arm.lean_of_links(arm.nominal).tolist()} if arm.leans else {}),
         "parallel_axes": [list(group) for group in arm.parallel_axes],
         "base_frame": "unknown" if arm.frame_per else values[:6],
         "tool_frame": "unknown" if arm.tool_per else values[-6:],
@@ -200,9 +204,7 @@ def chain_of(arm: SerialArm) -> tuple[_Frame, list[_Frame], _Frame]:
     """Base; fixed transforms before each joint's motion; and that behind the last, tool included."""
     n = len(arm.joints)
     values = arm.nominal
-    links = arm.links(values)
-    still = torch.zeros(n, dtype=torch.float64)
-    rotations, translations = arm._transform(links, still, still, arm.axes)
+    rotations, translations = arm.link_transforms(torch.zeros(n, dtype=torch.float64), values)
     fixed = [(rotations[i], translations[i]) for i in range(n)]
     base = rotation_vector_to_matrix(values[3:6]), values[:3]
     tool = rotation_vector_to_matrix(values[-3:]), values[-6:-3]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -11,6 +12,9 @@ from ccnn_torch.coordinates import Parameter
 from ccnn_torch.numerics.batching import stack_last
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, rotation_vector_to_matrix
 
+# Sine of the angle between axes below which they count as parallel: Denavit-Hartenberg parameters of axes at a degree
+# are as good as undetermined.
+_PARALLEL = 0.02
 # Plausible share by which a drive moves another joint, or its own too far: that of a gear or a scale.
 _DRIVE = 1e-3
 LinkTransform = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -46,21 +50,23 @@ Screws = tuple[Tensor, Tensor]
 Frames = tuple[Tensor, Tensor]
 
 
-def _standard_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) -> Screws:
-    """Of theta and d about and along z of the frame before, of a and alpha along and about x of the frame after."""
-    z, x = before[0][..., 2], after[0][..., 0]
+def _standard_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor, lean: Tensor) -> Screws:
+    """Of theta and d about and along z of the frame before, of a and alpha along and about x of the frame after, as it
+    is without the lean."""
+    z, x = before[0][..., 2], _along_x(after[0], -lean)
     parts = [_shift(x), _turn(x, after[1], tip), _shift(z), _turn(z, before[1], tip)]
     return torch.stack([p[0] for p in parts], -2), torch.stack([p[1] for p in parts], -2)
 
 
-def _modified_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) -> Screws:
-    """Of alpha and a about and along x of the frame before, of theta and d about and along z of the frame after."""
-    x, z = before[0][..., 0], after[0][..., 2]
+def _modified_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor, lean: Tensor) -> Screws:
+    """Of alpha and a about and along x of the frame before, as it leans, of theta and d about and along z of the frame
+    after."""
+    x, z = _along_x(before[0], lean), after[0][..., 2]
     parts = [_shift(x), _turn(x, before[1], tip), _shift(z), _turn(z, after[1], tip)]
     return torch.stack([p[0] for p in parts], -2), torch.stack([p[1] for p in parts], -2)
 
 
-def _origin_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) -> Screws:
+def _origin_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor, lean: Tensor) -> Screws:
     """Of x, y, z along the axes of the frame before, of roll, pitch and yaw about the origin that they lead to."""
     rotation, place = before
     origin = place + (rotation @ links[..., :3, None])[..., 0]
@@ -75,6 +81,16 @@ def _origin_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) ->
     return torch.cat([slides, turns], -2), torch.cat([torch.zeros_like(axes), axes], -2)
 
 
+def lean_screws(frames: Frames, tip: Tensor) -> Screws:
+    """Of the lean of each link about y of the frame beside it."""
+    return _turn(frames[0][..., 1], frames[1], tip)
+
+
+def _along_x(frame: Tensor, lean: Tensor) -> Tensor:
+    """The x axis, `... x 3`, of a frame `... x 3 x 3` that is turned about its y axis by `...` [rad]."""
+    return frame[..., 0] * lean.cos()[..., None] - frame[..., 2] * lean.sin()[..., None]
+
+
 def _shift(axis: Tensor) -> Screws:
     return axis, torch.zeros_like(axis)
 
@@ -83,14 +99,14 @@ def _turn(axis: Tensor, place: Tensor, tip: Tensor) -> Screws:
     return torch.linalg.cross(axis, tip - place, dim=-1), axis
 
 
-SCREWS: dict[str, Callable[[Tensor, Frames, Frames, Tensor], Screws]] = {
+SCREWS: dict[str, Callable[[Tensor, Frames, Frames, Tensor, Tensor], Screws]] = {
     "standard": _standard_screws,
     "modified": _modified_screws,
     "urdf": _origin_screws,
 }
 """Convention -> velocity of a tip `... x n x 3` and rate of rotation by each parameter of each link, `... x n x k x 3`
 each, in the arm's base: from links `... x n x k`, the frames before and after each (rotation `... x n x 3 x 3`, place
-`... x n x 3`) and the tip."""
+`... x n x 3`), the tip and the leans of the links `... x n`."""
 
 # Transform, parameter names of a link, their units, and whether the joint axis is fixed in the frame before the link
 # (standard DH: z of frame i - 1) or in the one behind it.
@@ -107,10 +123,29 @@ def compose(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tupl
     return rotation @ second[0], translation + (rotation @ second[1][..., None])[..., 0]
 
 
+def parallel_to_next(
+    convention: str, links: Sequence[Sequence[float]], groups: Sequence[Sequence[int]]
+) -> list[int]:
+    """Links (from 1) of a Denavit-Hartenberg table between joints whose axes are parallel by it, or are said to be.
+
+    Four parameters cannot tilt such an axis against the other about the direction across both (Hayati 1983).
+
+    groups: of joints (from 1) with parallel axes.
+    """
+    first = 0 if convention == "standard" else 1
+    near = {i for i in range(first, len(links) - 1 + first) if abs(math.sin(links[i][1])) < _PARALLEL}
+    told = {min(i, j) - 1 + first for group in groups for i in group for j in group if abs(i - j) == 1}
+    return [i + 1 for i in sorted(near | told)]
+
+
 def links_and_drives(
-    convention: str, links: Sequence[Sequence[float]], joint_units: Sequence[str], drives: Sequence[Sequence[int]]
+    convention: str,
+    links: Sequence[Sequence[float]],
+    joint_units: Sequence[str],
+    drives: Sequence[Sequence[int]],
+    leans: Sequence[Sequence[float]],
 ) -> list[Parameter]:
-    """Parameters of the links, then of the drives."""
+    """Parameters of the links, then of their leans, then of the drives."""
     _, names, units, _ = LINKS[convention]
     found = []
     for i, row in enumerate(links):
@@ -118,6 +153,10 @@ def links_and_drives(
         found += [
             Parameter(f"{p}{i + 1}", u, v, sense=zero.get(p, "")) for p, u, v in zip(names, units, row, strict=True)
         ]
+    for link, lean in leans:
+        i = int(link)
+        at, to = (i, i + 1) if convention == "standard" else (i - 1, i)
+        found.append(Parameter(f"beta{i}", "rad", lean, sense=f"lean of axis {to} against axis {at}"))
     for i, j in drives:
         to, by = joint_units[i - 1], joint_units[j - 1]
         found.append(Parameter(f"drive{i}{j}", "1" if to == by else f"{to}/{by}", 0.0, scale=_DRIVE))

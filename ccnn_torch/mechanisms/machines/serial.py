@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -22,12 +23,14 @@ from ccnn_torch.mechanisms.machines.links import (
     Screws,
     compose,
     counting,
+    lean_screws,
     links_and_drives,
+    parallel_to_next,
 )
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative, nearest
 from ccnn_torch.mechanisms.pose import frame_gap
-from ccnn_torch.numerics.batching import expand_leading
+from ccnn_torch.numerics.batching import expand_leading, stack_last
 from ccnn_torch.numerics.rotations import (
     matrix_to_euler_zyx,
     matrix_to_rotation_vector,
@@ -61,7 +64,7 @@ class SerialArm(Mechanism):
     """base · link 1 · … · link n · tool; pose x, y, z [m] and rotation vector rx, ry, rz [rad] in the record's frame.
 
     Parameters in order: the base frame (6: position, rotation vector), each link's (DH: a, alpha, d, theta; URDF: x, y,
-    z, roll, pitch, yaw), those of drives, the tool frame (6). With `numbers` these stand in the place of the links' and
+    z, roll, pitch, yaw), those of leans and of drives, the tool frame (6). With `numbers` these stand in the place of the links' and
     drives': each adds to some of them, so that the links are linear in what people know of the machine.
     `solve_inverse` is damped Newton to the closest pose in (position, rotation_weight x rotation vector), from `guess`:
     for records the guess is the commanded joints.
@@ -75,6 +78,8 @@ class SerialArm(Mechanism):
         rotation_weight: [m/rad].
         drives: pairs of joints i, j (from 1): the drive of joint j moves joint i as well, by parameter driveij for each
             unit; of i = j joint i is off by that share (lead, gear ratio).
+        leans: links (from 1) of Denavit-Hartenberg parameters that have a fifth one, betai [rad], by which the axis behind
+            (modified: of) the link leans about the y axis of its frame: Ry(beta) after (modified: before) the others.
         own_drives: what these and the tables of pitch errors do.
     """
 
@@ -85,6 +90,7 @@ class SerialArm(Mechanism):
     limits: Tensor
     _start: Tensor
     _shares: Tensor
+    _leaning: Tensor
     counting: Tensor
 
     def __init__(
@@ -109,6 +115,7 @@ class SerialArm(Mechanism):
         numbers: Sequence[Mapping[str, Any]] = (),
         goal_tool: Sequence[float] | None = None,
         tables: Sequence[Sequence[Sequence[float]] | None] | None = None,
+        leans: Sequence[Sequence[float]] = (),
     ) -> None:
         """Build from plain numbers [SI].
 
@@ -125,6 +132,7 @@ class SerialArm(Mechanism):
             limits: lowest and highest value per joint, for sampling only; a full turn or a metre when None.
             unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight, drives: see the class.
             tables: of each joint the places and the errors of its pitch-error table there, or None.
+            leans: pairs of a link (from 1), see the class, and its lean [rad].
             numbers: fields of a `Parameter`, and `of`: what one unit of it adds to links' and drives' parameters, by
                 name; `links` are then what is there without them.
 
@@ -132,7 +140,7 @@ class SerialArm(Mechanism):
             InputError: unknown convention or orientation.
         """
         keys = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        keys = {k: v for k, v in keys.items() if v is not None or k not in ("goal_tool", "tables")}
+        keys = {k: v for k, v in keys.items() if v or k not in ("goal_tool", "tables", "leans")}
         if convention not in LINKS or orientation not in ("rotation_vector", "none", "direction"):
             raise InputError(
                 f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector', 'none' or "
@@ -150,7 +158,7 @@ class SerialArm(Mechanism):
         shown = {c for c, _ in pose}
         geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(FRAME, base, strict=True)]
         joint_units = ["rad" if t == "revolute" else "m" for t in types]
-        own = links_and_drives(convention, links, joint_units, drives)
+        own = links_and_drives(convention, links, joint_units, drives, leans)
         if orientation == "direction" and n == len(MOUNT):
             named = {f"{p}{i}": sense for i, senses in enumerate(MOUNT, 1) for p, sense in senses.items()}
             own = [replace(p, sense=named.get(p.name, "")) for p in own]
@@ -183,9 +191,12 @@ class SerialArm(Mechanism):
         self.register_buffer("revolute", torch.tensor(turn))
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
         self.own_drives = Drives(drives, tables or [None] * n)
-        self.drives, self._named, self._links_size = tuple(map(tuple, drives)), bool(numbers), count - len(drives)
+        self.drives, self._named, self._links_size = tuple(map(tuple, drives)), bool(numbers), count - len(drives) - len(leans)
+        self.leans = tuple(int(i) for i, _ in leans)
         self.register_buffer("_start", start, persistent=False)
         self.register_buffer("_shares", shares, persistent=False)
+        which = torch.eye(n, dtype=torch.float64)[[int(i) - 1 for i, _ in leans]]
+        self.register_buffer("_leaning", which, persistent=False)
         self.register_buffer("counting", counting(convention, n, orientation == "direction"))
         self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
         self._follow_nominal()
@@ -204,6 +215,33 @@ class SerialArm(Mechanism):
         lengths = rows[:, :3] if self.convention == "urdf" else rows[:, (0, 2)]
         travel = self.limits.abs().amax(-1)[~self.revolute].sum()
         return float(lengths.norm(dim=-1).sum() + self.nominal[-6:-3].norm() + travel)
+
+    @cached_property
+    def joint_of(self) -> dict[str, str]:
+        """The joint before or in each link, by the names of the link's parameters; none where they have own words."""
+        if self._named:
+            return {}
+        names = (*LINKS[self.convention][1], "beta")
+        return {f"{p}{i}": joint.name for i, joint in enumerate(self.joints, 1) for p in names}
+
+    def with_leans(self) -> SerialArm:
+        """The same arm, nominal parameters included, with a fifth parameter of each link between parallel axes.
+
+        An arm whose links are no Denavit-Hartenberg table, or that has parameters of its own, is returned as it is.
+        """
+        if self.convention == "urdf" or self._named:
+            return self
+        parallel = parallel_to_next(self.convention, self.links(self.nominal).tolist(), self.parallel_axes)
+        if set(parallel) <= set(self.leans):
+            return self
+        every = self.lean_of_links(self.nominal).tolist()
+        leans = [[i, every[i - 1]] for i in sorted({*parallel, *self.leans})]
+        twin = SerialArm(**{**self.recipe["keys"], "leans": leans})
+        own, behind = 6 + self._links_size, 6 + self._links_size + len(self.leans)
+        added = self.nominal.new_tensor([lean for _, lean in leans])
+        twin.nominal.copy_(torch.cat([self.nominal[:own], added, self.nominal[behind:]]))
+        twin._follow_nominal()
+        return twin
 
     def with_link_frames(self) -> SerialArm:
         """The same arm with six parameters a link, in the URDF form, nominal parameters and kinematics unchanged.
@@ -232,6 +270,7 @@ class SerialArm(Mechanism):
             **{
                 **keys,
                 "convention": "urdf",
+                "leans": [],
                 "links": links.tolist(),
                 "base": self.nominal[:6].tolist(),
                 "tool": from_last(self.nominal[-6:]),
@@ -308,8 +347,13 @@ class SerialArm(Mechanism):
         own = self._of_links(values)[..., : self._links_size]
         return own.reshape(*values.shape[:-1], len(self.joints), -1) * self.counting
 
+    def lean_of_links(self, values: Tensor) -> Tensor:
+        """By which each link leans, `... x n` [rad]."""
+        own = self._of_links(values)[..., self._links_size : self._links_size + len(self.leans)]
+        return own @ self._leaning
+
     def _of_links(self, values: Tensor) -> Tensor:
-        """Parameters of the links, then of the drives."""
+        """Parameters of the links, then of their leans, then of the drives."""
         own = values[..., 6:-6]
         return self._start + own @ self._shares if self._named else own
 
@@ -321,7 +365,7 @@ class SerialArm(Mechanism):
 
     def of_drives(self, values: Tensor) -> Tensor:
         """Parameters of the drives, `... x d`, of all parameters `... x k` [SI]."""
-        return self._of_links(values)[..., self._links_size :]
+        return self._of_links(values)[..., self._links_size + len(self.leans) :]
 
     def driven(self, joints: Tensor, values: Tensor) -> Tensor:
         """Joints as the drives move them, `... x n`."""
@@ -336,7 +380,15 @@ class SerialArm(Mechanism):
         joints: as the drives move them.
         """
         motion = joints * self.signs
-        return self._transform(self.links(values), motion * self.revolute, motion * ~self.revolute, self.axes)
+        turns, places = self._transform(self.links(values), motion * self.revolute, motion * ~self.revolute, self.axes)
+        if not self.leans:
+            return turns, places
+        lean = self.lean_of_links(values)
+        s, c, zero, one = lean.sin(), lean.cos(), torch.zeros_like(lean), torch.ones_like(lean)
+        by = stack_last(c, zero, s, zero, one, zero, -s, zero, c).reshape(*lean.shape, 3, 3)
+        if self._axis_before:
+            return turns @ by, places
+        return by @ turns, (by @ places[..., None])[..., 0]
 
     def link_frames(self, joints: Tensor, values: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Frames of the links one after the other, n + 1 of them, from the arm's own base to the flange."""
@@ -388,8 +440,8 @@ class SerialArm(Mechanism):
         return torch.where(turning, swept, axes) * signs, axes * turning * signs
 
     def _by_own(self, columns: Tensor, rates: Tensor, joints: Tensor) -> Tensor:
-        """Columns of the parameters between the frames, `... x k x 3`, from those of the links `... x l x 3` and of the
-        joints as driven `... x n x 3`."""
+        """Columns of the parameters between the frames, `... x k x 3`, from those of the links and their leans `... x l x 3`
+        and of the joints as driven `... x n x 3`."""
         if self.drives:
             by = self.own_drives.of(joints)
             more = [rates[..., i - 1, :] * by[..., k, None] for k, (i, _) in enumerate(self.drives)]
@@ -409,14 +461,18 @@ class SerialArm(Mechanism):
         lead = tip.shape[:-1]
         before = rotations[..., :-1, :, :].expand(*lead, count, 3, 3), places[..., :-1, :].expand(*lead, count, 3)
         after = rotations[..., 1:, :, :], places[..., 1:, :]
+        tips = tip[..., None, :].expand(*lead, count, 3)
         moved, turned = SCREWS[self.convention](
-            links.expand(*lead, *links.shape[-2:]), before, after, tip[..., None, :].expand(*lead, count, 3)
+            links.expand(*lead, *links.shape[-2:]), before, after, tips, self.lean_of_links(values)
         )
+        leaning = self._leaning @ torch.stack(lean_screws(after if self._axis_before else before, tips))
         base = rotation_vector_to_matrix(values[..., 3:6])
         # `... x 3 x k` each, in the frame of the poses.
         linear, angular = (
-            base @ self._by_own(part.flatten(-3, -2), rate, joints).mT
-            for part, rate in zip((moved * self.counting[..., None], turned), self._rates(frames, values), strict=True)
+            base @ self._by_own(torch.cat([part.flatten(-3, -2), lean], -2), rate, joints).mT
+            for part, lean, rate in zip(
+                (moved * self.counting[..., None], turned), leaning, self._rates(frames, values), strict=True
+            )
         )
         base_rate, tool_rate = (rotation_vector_rate(values[..., k : k + 3]) for k in (3, values.shape[-1] - 3))
         lever = (base @ tip[..., None])[..., 0]
