@@ -146,7 +146,7 @@ def test_a_tracker_that_lost_the_orientation(tmp_path: Path, monkeypatch: pytest
     machine, truth = arm(tmp_path)
     left_by = {}
     for name in ("mixed", "whole"):
-        made = identify(records=f"{name}.csv", mechanism="arm.yaml", links="six", refit=False, save_report=False)
+        made = identify(records=f"{name}.csv", mechanism="arm.yaml", refit=False, save_report=False)
         made.save(tmp_path / name)
         found = made.mechanism()
         joints = machine.sample_joints(200, torch.Generator().manual_seed(9))

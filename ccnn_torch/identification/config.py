@@ -150,10 +150,10 @@ class IdentifyConfig(JobConfig):
         description="a mechanism's name, a DH file (.yaml), a URDF, an identified.yaml, or file.py:Name",
     )
     mechanism_keys: MechanismKeys
-    links: Literal["given", "six"] = Field(
-        default="given",
-        description="parameters of a serial arm's links: those of its file (given), or a place and a turn of each "
-        "(six), which can also tilt parallel axes",
+    links: Literal["lean", "given"] = Field(
+        default="lean",
+        description="parameters of a serial arm's links: those of its file, and of parallel axes their lean against "
+        "each other, which a Denavit-Hartenberg table lacks (lean); or those of its file alone (given)",
     )
     frame: FrameConfig = Field(default_factory=FrameConfig)
     records: Files | None = Field(

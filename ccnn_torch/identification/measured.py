@@ -160,13 +160,10 @@ class Measured:
 
 
 def nominal_machine(config: IdentifyConfig) -> Mechanism:
-    """The mechanism that the config names, with as many parameters a link as it asks for."""
+    """The mechanism that the config names, an arm with the parameters of its links that it asks for."""
     mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
-    if config.links == "given":
-        return mechanism
-    if not isinstance(mechanism, SerialArm):
-        raise InputError(f"links: {mechanism.name} is no serial arm; remove the key")
-    return mechanism.with_link_frames()
+    lean = config.links == "lean" and isinstance(mechanism, SerialArm)
+    return mechanism.with_leans() if lean else mechanism
 
 
 def held_by_priors(config: IdentifyConfig, mechanism: Mechanism) -> bool:

@@ -28,7 +28,7 @@ from ccnn_torch.identification.solve import (
     is_apart,
     pieces_of,
 )
-from ccnn_torch.mechanisms import Giving, PoseError, SerialArm, SetUps
+from ccnn_torch.mechanisms import Giving, PoseError, SetUps
 from ccnn_torch.verification.promise import configurations, of_whole, promise_block
 from ccnn_torch.version import __version__
 
@@ -138,7 +138,6 @@ def assemble(
     # Of a simulated machine the noise is what it is: there only the held-out error is judged.
     given, position = config.noise is not None, test["position"] or {}
     doubts = doubts_of(test, float(known.noise[0]), float(known.freedom[0]), position.get("noise", noise), given)
-    doubts += _of_parallel_axes(measured, first.outcome)
     messages = [f"{name}: {one.outcome.message}" for name, one in found.items() if one.outcome.message]
     results = {
         "name": config.name,
@@ -176,28 +175,6 @@ def assemble(
     for when, error in errors.items():
         arrays |= {f"{part}_{when}": each for part, each in error._asdict().items() if each is not None}
     return results, arrays
-
-
-# From here on an angle that stands for a tilt of parallel axes has gone far [rad].
-_FAR = 0.1
-
-
-def _of_parallel_axes(measured: Measured, outcome: Outcome) -> list[str]:
-    """Where Denavit-Hartenberg parameters had to tilt parallel axes, which they cannot (Hayati 1983)."""
-    arm = measured.mechanism
-    if not isinstance(arm, SerialArm) or arm.convention == "urdf":
-        return []
-    _, alpha, _, theta = arm.links(measured.start[0]).unbind(-1)
-    between = alpha[:-1] if arm.convention == "standard" else alpha[1:]
-    both = arm.revolute[:-1] & arm.revolute[1:] & (between.sin().abs() < 1e-6)
-    moved = (arm.links(outcome.values[0])[:, 3] - theta).abs() > _FAR
-    if not bool(both.any()) or (bool(outcome.converged[0]) and not bool(moved.any())):
-        return []
-    i = int(both.double().argmax()) + 1
-    return [
-        f"The axes of joints {i} and {i + 1} are parallel, and Denavit-Hartenberg parameters cannot tilt one against "
-        "the other: write links=six, or a machine file with such tilts (ccnn new --mechanism scara)."
-    ]
 
 
 def _method_block(measured: Measured, found: Found) -> dict[str, Any]:

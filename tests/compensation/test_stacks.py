@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from fitted import as_urdf
 from machines import known, parallel
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -128,10 +129,11 @@ def test_the_public_form_of_ur_description_is_read_the_same_way() -> None:
     assert_same(read_ur(UR_SAMPLE, joints), ur10(), joints, 1e-8)
 
 
-@pytest.mark.parametrize("form", ["DH", "link frames", "URDF turned by half"])
+@pytest.mark.parametrize("form", ["DH", "leans", "URDF", "URDF turned by half"])
 def test_ur_description_has_the_identified_arm(tmp_path: Path, form: str) -> None:
-    arm = ur10() if form == "DH" else ur10().with_link_frames()
-    if form.startswith("URDF"):
+    arm = as_urdf(ur10()) if form.startswith("URDF") else ur10()
+    arm = arm.with_leans() if form == "leans" else arm
+    if form.endswith("half"):
         # As ur_description has it: base_link is turned by half against the first joint's frame.
         keys = arm.recipe["keys"]
         arm = SerialArm(**{**keys, "links": [[0, 0, 0, 0, 0, math.pi], *keys["links"][1:]]})
@@ -338,14 +340,14 @@ def read_hal(text: str) -> dict[str, float]:
     return {name: float(value) for _, name, value in lines}
 
 
-@pytest.mark.parametrize("form", ["standard", "link frames", "signs"])
+@pytest.mark.parametrize("form", ["standard", "leans", "URDF", "signs"])
 def test_genserkins_has_the_identified_arm(tmp_path: Path, form: str) -> None:
     assert read_hal(HAL_SAMPLE)["genserkins.ALPHA-1"] == -1.570796326
     arm = known("arm").mechanism
     assert isinstance(arm, SerialArm)
     if form == "signs":
         arm = SerialArm(**{**arm.recipe["keys"], "joint_sign": [1, -1, 1, 1, -1, 1]})
-    arm = arm.with_link_frames() if form == "link frames" else arm
+    arm = {"leans": SerialArm.with_leans, "URDF": as_urdf}.get(form, lambda same: same)(arm)
     path, real = identified(tmp_path, arm, 5e-4)
     files = export_model(path, "linuxcnc_hal", tmp_path / "out")
     pins, readme = read_hal(files["kinematics.hal"].read_text()), files["README.md"].read_text()

@@ -230,7 +230,7 @@ def test_links_hold_where_the_arm_stands_elsewhere(tmp_path: Path) -> None:
     columns |= {c.header: pose[:, i].numpy() for i, c in enumerate(real.pose)}
     write_table(tmp_path / "elsewhere.csv", columns)
     keys = {"mechanism": str(file), "records": str(rows), "noise": 1e-5, "save_report": False}
-    for links in ("given", "six"):
+    for links in ("given", "lean"):
         found = ccnn_torch.identify(**keys, links=links, transfer=str(tmp_path / "elsewhere.csv"))
         block = found.results["transfer"]
         assert block["rows"] == {"train": 28, "test": 12} and block["records"].endswith("/elsewhere.csv")
@@ -275,7 +275,6 @@ def test_rows_that_cannot_be_are_named(tmp_path: Path) -> None:
         ({"simulate": {}, "settings": {"lm": {"start": 3}}}, "has no setting 'start'; did you mean 'starts'"),
         ({"simulate": {}, "residual": "forward", "methods": ["lm_per_leg"]}, "a pose depends on all legs"),
         ({"simulate": {}, "transfer": "rows.csv"}, "transfer: needs measured records"),
-        ({"simulate": {}, "links": "six"}, "links: five_bar is no serial arm"),
     ],
 )
 def test_what_cannot_be_identified_is_one_sentence(keys: dict[str, Any], message: str) -> None:

@@ -123,9 +123,7 @@ def compose(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tupl
     return rotation @ second[0], translation + (rotation @ second[1][..., None])[..., 0]
 
 
-def parallel_to_next(
-    convention: str, links: Sequence[Sequence[float]], groups: Sequence[Sequence[int]]
-) -> list[int]:
+def parallel_to_next(convention: str, links: Sequence[Sequence[float]], groups: Sequence[Sequence[int]]) -> list[int]:
     """Links (from 1) of a Denavit-Hartenberg table between joints whose axes are parallel by it, or are said to be.
 
     Four parameters cannot tilt such an axis against the other about the direction across both (Hayati 1983).

@@ -32,7 +32,6 @@ from ccnn_torch.mechanisms.newton import carry_derivative, nearest
 from ccnn_torch.mechanisms.pose import frame_gap
 from ccnn_torch.numerics.batching import expand_leading, stack_last
 from ccnn_torch.numerics.rotations import (
-    matrix_to_euler_zyx,
     matrix_to_rotation_vector,
     rotation_vector_rate,
     rotation_vector_to_matrix,
@@ -64,8 +63,9 @@ class SerialArm(Mechanism):
     """base · link 1 · … · link n · tool; pose x, y, z [m] and rotation vector rx, ry, rz [rad] in the record's frame.
 
     Parameters in order: the base frame (6: position, rotation vector), each link's (DH: a, alpha, d, theta; URDF: x, y,
-    z, roll, pitch, yaw), those of leans and of drives, the tool frame (6). With `numbers` these stand in the place of the links' and
-    drives': each adds to some of them, so that the links are linear in what people know of the machine.
+    z, roll, pitch, yaw), those of leans and of drives, the tool frame (6). With `numbers` these stand in the place of
+    those of links and drives: each adds to some of them, so that the links are linear in what people know of the
+    machine.
     `solve_inverse` is damped Newton to the closest pose in (position, rotation_weight x rotation vector), from `guess`:
     for records the guess is the commanded joints.
 
@@ -78,8 +78,8 @@ class SerialArm(Mechanism):
         rotation_weight: [m/rad].
         drives: pairs of joints i, j (from 1): the drive of joint j moves joint i as well, by parameter driveij for each
             unit; of i = j joint i is off by that share (lead, gear ratio).
-        leans: links (from 1) of Denavit-Hartenberg parameters that have a fifth one, betai [rad], by which the axis behind
-            (modified: of) the link leans about the y axis of its frame: Ry(beta) after (modified: before) the others.
+        leans: links (from 1) with a fifth Denavit-Hartenberg parameter, betai [rad], by which the axis at the link's
+            end (modified: its own) leans about y of the frame there: Ry(beta) after (modified: before) the others.
         own_drives: what these and the tables of pitch errors do.
     """
 
@@ -191,8 +191,8 @@ class SerialArm(Mechanism):
         self.register_buffer("revolute", torch.tensor(turn))
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
         self.own_drives = Drives(drives, tables or [None] * n)
-        self.drives, self._named, self._links_size = tuple(map(tuple, drives)), bool(numbers), count - len(drives) - len(leans)
-        self.leans = tuple(int(i) for i, _ in leans)
+        self.drives, self._named = tuple(map(tuple, drives)), bool(numbers)
+        self.leans, self._links_size = tuple(int(i) for i, _ in leans), count - len(drives) - len(leans)
         self.register_buffer("_start", start, persistent=False)
         self.register_buffer("_shares", shares, persistent=False)
         which = torch.eye(n, dtype=torch.float64)[[int(i) - 1 for i, _ in leans]]
@@ -242,43 +242,6 @@ class SerialArm(Mechanism):
         twin.nominal.copy_(torch.cat([self.nominal[:own], added, self.nominal[behind:]]))
         twin._follow_nominal()
         return twin
-
-    def with_link_frames(self) -> SerialArm:
-        """The same arm with six parameters a link, in the URDF form, nominal parameters and kinematics unchanged.
-
-        Four Denavit-Hartenberg parameters cannot tilt one of two parallel axes about the direction across
-        both (Hayati 1983); a UR10 has three such axes. The nominal tool frame takes in the constant part of the last
-        link; frames that are unknown stay so.
-        """
-        if self.convention == "urdf":
-            return self
-        keys, zero = self.recipe["keys"], torch.zeros(len(self.joints), dtype=torch.float64)
-        rotations, places = self.link_transforms(zero, self.nominal)
-        angles = matrix_to_euler_zyx(rotations).flip(-1)
-        links = torch.cat([places, angles], dim=-1)
-        before = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-        if self._axis_before:
-            links = torch.cat([torch.zeros_like(links[:1]), links[:-1]])
-            before = rotations[-1], places[-1]
-
-        def from_last(frame: Tensor) -> list[float]:
-            turn, place = compose(before, (rotation_vector_to_matrix(frame[3:]), frame[:3]))
-            return [*place.tolist(), *matrix_to_rotation_vector(turn).tolist()]
-
-        goal = keys.get("goal_tool")
-        return SerialArm(
-            **{
-                **keys,
-                "convention": "urdf",
-                "leans": [],
-                "links": links.tolist(),
-                "base": self.nominal[:6].tolist(),
-                "tool": from_last(self.nominal[-6:]),
-                "goal_tool": None if goal is None else from_last(torch.tensor(goal, dtype=torch.float64)),
-                "tool_offset": None,
-                "unknown_frames": list(self.unknown_frames),
-            }
-        )
 
     def with_orientation(self, orientation: str) -> SerialArm:
         """The same arm, nominal parameters included, for poses of another kind: "none", "direction" …"""
@@ -440,8 +403,8 @@ class SerialArm(Mechanism):
         return torch.where(turning, swept, axes) * signs, axes * turning * signs
 
     def _by_own(self, columns: Tensor, rates: Tensor, joints: Tensor) -> Tensor:
-        """Columns of the parameters between the frames, `... x k x 3`, from those of the links and their leans `... x l x 3`
-        and of the joints as driven `... x n x 3`."""
+        """Columns of the parameters between the frames, `... x k x 3`, from those of links and leans `... x l x 3` and
+        of the joints as driven `... x n x 3`."""
         if self.drives:
             by = self.own_drives.of(joints)
             more = [rates[..., i - 1, :] * by[..., k, None] for k, (i, _) in enumerate(self.drives)]
