@@ -309,6 +309,13 @@ def test_keys_that_do_not_go_together(played: Path, tmp_path: Path) -> None:
         prepare(RunConfig.from_keys(**keys(played, records=str(tmp_path / "unloaded.csv"))))
     with pytest.raises(InputError, match="there is no such file"):
         prepare(RunConfig.from_keys(**keys(played, effects="from:nowhere.json")))
+    for ends, sentence in (
+        ({"load_q": [0, 1]}, "load_q: this run has no such covariate; did you mean 'load_"),
+        ({"load_x": ["10 N", "-1 kN"]}, r"load_x: the lower end comes first, and \[10 N, -1 kN\] does not ascend"),
+        ({"load_x": ["0 m", "1 m"]}, "load_x is in .m., a length, but must be a force"),
+    ):
+        with pytest.raises(InputError, match=rf"compensation\.ends\.{sentence}"):
+            prepare(RunConfig.from_keys(**keys(played, compensation={"ends": ends})))
 
 
 def test_paths_start_where_the_key_stands(played: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

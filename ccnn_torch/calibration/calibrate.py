@@ -14,7 +14,7 @@ from torch import Tensor
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
 from ccnn_torch.calibration.fitting import Comparison, Fitted, compare, fit_method, on_other_rows, refit
-from ccnn_torch.calibration.prepare import Prepared, damping_of, over_all_rows, prepare
+from ccnn_torch.calibration.prepare import Prepared, damping_of, ends_of, over_all_rows, prepare
 from ccnn_torch.calibration.result import best_method, chosen_by, plan_of, run_results
 from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -251,6 +251,10 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
             deviations = deviations.repeat(2, 1)
     names = [c.name for c in covariates]
     physics = {} if prepared.physics is None else prepared.physics.modules(repeat, there, margin, names)
+    if "machine" in physics:
+        physics["machine"].ends = ends_of(config, prepared.covariate_coordinates)
+    elif config.compensation.ends:
+        raise InputError("compensation.ends: effects of this machine are fitted to what was measured; remove the key")
     if physics and "machine" not in physics and limit is None:
         # What geometry and effects leave at singular poses can be larger than what was there.
         limit = default_limit(prepared.total[repeat, there])

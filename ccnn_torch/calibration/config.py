@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
+from ccnn_torch.config.sizes import Size
 from ccnn_torch.config.split import SplitConfig
 from ccnn_torch.config.tree import (
     Columns,
@@ -73,6 +74,11 @@ class CompensationConfig(_Part):
         min_length=1,
         description="hard limit of the correction in SI, one number or one per joint; null = 1.5 times the largest "
         "training deviation of each joint",
+    )
+    ends: dict[str, Annotated[list[Size], Field(min_length=2, max_length=2)]] = Field(
+        default={},
+        description="lowest and highest value of a covariate up to which its effects act where it goes beyond what was "
+        "measured, e.g. {load_z: [-150 N, 0 N]}; what was measured where nothing is said",
     )
 
 

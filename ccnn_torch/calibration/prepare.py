@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ from ccnn_torch.calibration.physics import (
     verdict_of,
     without_frame_drift,
 )
+from ccnn_torch.config.sizes import size
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
@@ -35,6 +36,7 @@ from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.load import fewest_rows
 from ccnn_torch.records.splits import Column, Split
 from ccnn_torch.simulation.case_study import Simulation, build_case
+from ccnn_torch.spelling import hint
 
 # Of the realistic machines.
 _MOST_JOINTS = 6
@@ -218,6 +220,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     verdict = verdict_of(effects, mechanism) if isinstance(effects, str) and effects.startswith("from:") else None
     source = with_test_file(config.records if given is None else given, config.split)
     records = load_records(source, mechanism, config.covariates, columns=config.columns, joint_map=config.joint_map)
+    ends_of(config, records.covariate_coordinates)
     doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
@@ -325,6 +328,24 @@ def _choice(
     about = (settings, verdict, asked, _unlearnable(mechanism, records))
     choice = choose_model(config, mechanism, records, split, *about)
     return choice, verdict if choice.effects else None, records, notes
+
+
+def ends_of(config: RunConfig, covariates: Sequence[Coordinate]) -> dict[str, tuple[float, float]]:
+    """Lowest and highest value [SI] of each covariate of `compensation.ends`, by its name.
+
+    Raises:
+        InputError: a run has no such covariate, or its ends do not ascend.
+    """
+    units, found = {c.name: c.unit for c in covariates}, {}
+    for name, pair in config.compensation.ends.items():
+        key = f"compensation.ends.{name}"
+        if name not in units:
+            raise InputError(f"{key}: this run has no such covariate; {hint(name, [*units])}")
+        low, high = (size(value, units[name], key) for value in pair)
+        if not low < high:
+            raise InputError(f"{key}: the lower end comes first, and [{pair[0]}, {pair[1]}] does not ascend")
+        found[name] = (low, high)
+    return found
 
 
 def damping_of(config: RunConfig, mechanism: Mechanism) -> float:

@@ -246,10 +246,20 @@ class Compensator(nn.Module):
         return (correction.abs() <= self.most * (1 + 1e-9)).all(-1, keepdim=True)
 
     def held(self, covariates: Tensor) -> Tensor:
-        """Covariates held at the ends of what was measured."""
+        """Covariates held at the ends up to which effects follow them."""
+        low, high = self.ends
+        return torch.minimum(torch.maximum(covariates, low), high)
+
+    @property
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest covariates that effects follow, `m` each [SI]: what was measured, or wider as was told."""
         n = len(self.joints)
         centre, half = self.domain.centre[n:], self.domain.half_range[n:]
-        return torch.minimum(torch.maximum(covariates, centre - half), centre + half)
+        told = {} if self.machine is None else self.machine.ends
+        if not told:
+            return centre - half, centre + half
+        wide = centre.new_tensor([told.get(c.name, (torch.inf, -torch.inf)) for c in self.covariates])
+        return torch.minimum(centre - half, wide[:, 0]), torch.maximum(centre + half, wide[:, 1])
 
     def limited(self, deviation: Tensor) -> Tensor:
         """Within the limit."""

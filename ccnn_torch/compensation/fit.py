@@ -267,6 +267,11 @@ def settle(compensator: Compensator, inputs: Tensor) -> None:
     machine, n = compensator.machine, len(compensator.joints)
     assert machine is not None
     points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED // 2)
+    if machine.ends:
+        # Every second one somewhere between the ends.
+        low, high = compensator.ends
+        share = torch.rand(points[::2, n:].shape, generator=torch.Generator().manual_seed(2), dtype=points.dtype)
+        points[::2, n:] = low + (high - low) * share
     compensator.most.fill_(_FAR)
     compensator.domain.huge[:n] = FARTHEST
     rule, best = machine.rule, math.inf

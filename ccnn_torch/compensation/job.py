@@ -377,8 +377,12 @@ def sentences(output: Path, found: Compensated, model: LoadedModel) -> list[str]
             measured = len(model.machine.joints) > 0
             what = what if measured else "the joints of the identified machine"
             then = "geometry and effects hold there too" if measured else "its geometry holds there too"
-        if model.covariates:
-            then += f", with {', '.join(c.name for c in model.covariates)} held at the ends of what was measured"
+        ends, names = model.facts.get("machine", {}).get("ends", {}), [c.name for c in model.covariates]
+        held, told = ([name for name in names if (name in ends) == wide] for wide in (False, True))
+        if held:
+            then += f", with {', '.join(held)} held at the ends of what was measured"
+        if told:
+            then += f"{' and' if held else ', with'} {', '.join(told)} at the ends told in compensation.ends"
         said.append(f"{found.outside} of them {_is(found.outside)} outside {what} (inside_domain = 0): {then}.")
     if found.damped:
         said.append(

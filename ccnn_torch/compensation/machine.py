@@ -73,6 +73,8 @@ class Machine(nn.Module):
         effects: on joints and pose; None without any.
         rule: of commands near singular poses.
         low, high: limits of the joints, `n` [SI]; infinite where the machine's file has none.
+        ends: lowest and highest value [SI] up to which effects follow a covariate, by its name, where these are wider
+            than what was measured.
         export_tolerance: share of the largest deviation to which exports agree: lengths near 1 m are rounded.
     """
 
@@ -89,6 +91,7 @@ class Machine(nn.Module):
         # In a tuple, since the mechanism's own buffers are no part of the model.
         self._mechanism = (mechanism,)
         self.rule, self.effects = rule, effects
+        self.ends: dict[str, tuple[float, float]] = {}
         self.register_buffer("identified", identified.detach().clone(), persistent=False)
         low, high = limits_of(mechanism)
         self.register_buffer("low", low, persistent=False)
@@ -146,6 +149,7 @@ class Machine(nn.Module):
             "identified": self.identified.tolist(),
             "effects": None if self.effects is None else self.effects.describe(),
             "rule": self.rule._asdict(),
+            **({"ends": {name: list(pair) for name, pair in self.ends.items()}} if self.ends else {}),
         }
 
     @classmethod
@@ -156,7 +160,9 @@ class Machine(nn.Module):
         effects = None if description["effects"] is None else PhysicalEffects.from_description(description["effects"])
         identified = torch.tensor(description["identified"], dtype=torch.float64)
         more = cls._blank(mechanism, description)
-        return cls(mechanism, identified, effects, Rule(**description["rule"]), **more)
+        made = cls(mechanism, identified, effects, Rule(**description["rule"]), **more)
+        made.ends = {name: (low, high) for name, (low, high) in description.get("ends", {}).items()}
+        return made
 
     @classmethod
     def _blank(cls, mechanism: Mechanism, description: dict[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -57,13 +57,15 @@ class Known:
         """Position and rotation vector of the true machine at command and what was learned there, `s x c` [m, rad]."""
         return reached(self.situation(moved, covariates), self.acting, self.identified)
 
-    def compensator(self, size: float = 1e-5) -> Compensator:
-        """What commands it; `size` is what was learned beside it [SI], 0 for nothing."""
+    def compensator(self, size: float = 1e-5, ends: Mapping[str, tuple[float, float]] | None = None) -> Compensator:
+        """What commands it; `size` is what was learned beside it [SI], 0 for nothing; `ends` as a machine has them."""
         joints, inputs = self.joints, self.inputs
         names, units = [*self.covariates], covariate_units(self.mechanism)
         situation = self.situation(joints, inputs[:, joints.shape[1] :])
         effects = expand_effects(situation, self.acting, names, 0.1, None) if self.acting else None
         machine = build_machine(self.mechanism, self.identified, effects, joints, 0.1)
+        if machine is not None:
+            machine.ends.update(ends or {})
         network, scaling, deviations = small_network(inputs, size, joints.shape[1])
         columns = [Coordinate(name, units[name]) for name in names]
         about = (network, scaling, inputs, deviations, self.mechanism.joints, columns)

@@ -277,6 +277,25 @@ def test_covariates_are_held_at_the_ends_of_what_was_measured() -> None:
     assert float((found.command - below).abs().max()) > 10 * float(made.limit.max())
 
 
+def test_effects_follow_a_covariate_to_the_ends_that_were_told(tmp_path: Path) -> None:
+    machine = with_effects(sliding_arm(), ("compliance",), ("load_z",), 0.01)
+    far = 3 * machine.covariates["load_z"].mul_(100).abs().amax().reshape(1, 1)
+    narrow = machine.compensator()
+    joints = narrow.domain.centre[None, :3]
+
+    def missed(found: torch.Tensor) -> float:
+        moved = found + narrow.learned(found, far)
+        return float(apart(machine.frame(moved, far), wanted(machine, joints)))
+
+    assert missed(solved(narrow, joints, far).command) > 1e4 * TOLERANCE
+    wide = machine.compensator(ends={"load_z": (-2 * float(far), 2 * float(far))})
+    assert solved(wide, joints, far).status.tolist() == [OUTSIDE] and bool((wide.most > narrow.most).any())
+    paths = save_model(tmp_path, wide, fields() | {"mechanism": machine.mechanism.describe()}, forms=("onnx",))
+    for form in ("safetensors", "onnx"):
+        assert missed(torch.from_numpy(load_model(paths[form])(joints.numpy(), far.numpy())["command"])) < TOLERANCE
+    assert missed(torch.from_numpy(run_form(form_of(wide), joints.numpy(), far.numpy())["command"])) < TOLERANCE
+
+
 def test_a_load_above_1e3_newton_is_a_number() -> None:
     """Only joints beyond 1e3 are none."""
     machine = with_effects(sliding_arm(), ("compliance",), ("load_z",), 0.01)

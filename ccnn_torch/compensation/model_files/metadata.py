@@ -167,6 +167,7 @@ class Acting(_Form):
 class Closed(_Form):
     degree: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
     newton: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
+    ends: dict[str, Annotated[list[_Number], Field(min_length=2, max_length=2)]] = {}
     effects: Acting | None = None
 
 
