@@ -55,6 +55,8 @@ def as_read(unit: str) -> str:
     return _WHOLE.get(unit) or _LETTERS.sub(lambda word: _BY_WORD.get(word[0], word[0]), unit)
 
 
+STANDARD_GRAVITY = 9.80665
+"""m/s^2."""
 LARGEST = 1e12
 """No number of a record or a geometry file is larger in SI: it is 7 times the Earth's distance from the Sun in m, a
 stiffness or a pressure beyond steel's, and sums of its square still keep the smaller terms."""

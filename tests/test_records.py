@@ -15,6 +15,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.records import Records, check_rows, load_records, write_table
+from ccnn_torch.records.read_table import read_parts
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,21 @@ def test_every_default_covariate_and_no_other(tmp_path: Path) -> None:
     expected = {"temperature": "K"} | {h.partition("[")[0]: unit for h, unit in extra.items() if unit}
     assert {c.name: c.unit for c in records.covariate_coordinates} == expected
     assert any("ignored columns: goal_y, row, loading, times, my_speed;" in note for note in records.notes)
+
+
+def test_a_payload_in_kilograms_is_a_load(tmp_path: Path) -> None:
+    mass = np.linspace(0, 11, ROWS)
+    records = load(tmp_path, arm_columns() | {"payload[g]": 1e3 * mass}, Arm())
+    assert records.covariate_coordinates == (Coordinate("load_z", "N"),)
+    np.testing.assert_allclose(records.covariates[:, 0].numpy(), -9.80665 * mass, rtol=1e-14)
+    assert any("payload[g] counts as load_z" in note for note in records.notes)
+    assert not any("ignored" in note for note in records.notes)
+    np.testing.assert_allclose(next(read_parts(tmp_path / "records.csv", 5)).column("load_z"), -9.80665 * mass[:5])
+    # Beside a load, or where it is no mass, it is one more column.
+    for more in ({"payload[kg]": mass, "load_x[N]": mass}, {"payload[N]": mass}):
+        records = load(tmp_path, arm_columns() | more, Arm())
+        assert "load_z" not in {c.name for c in records.covariate_coordinates}
+        assert any("ignored columns: payload;" in note for note in records.notes)
 
 
 def test_misspelt_default_covariate_is_pointed_out(tmp_path: Path) -> None:

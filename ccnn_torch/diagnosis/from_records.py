@@ -53,6 +53,7 @@ from ccnn_torch.records import Records, load_records
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES
 from ccnn_torch.records.load import FILE, is_frame
 from ccnn_torch.records.read_table import Frame
+from ccnn_torch.records.table import PAYLOAD
 from ccnn_torch.units import LARGEST, parse_header, si_unit_of
 
 
@@ -206,7 +207,7 @@ def _unread(records: Records, situation: Situation, said: Diagnosis) -> list[str
     mechanism = situation.mechanism
     known = [*DEFAULT_COVARIATES, *situation.covariates, *(condition.name for condition in mechanism.takes)]
     known += [*mechanism.frame_per, *mechanism.tool_per]
-    known += [FILE] if records.parts else []
+    known += ([FILE] if records.parts else []) + ([PAYLOAD] if "load_z" in situation.covariates else [])
     known += [name for c in mechanism.pose for name in column_names(c.name)] if said.noise == "columns" else []
     names = [name for name in records.columns if not any(fnmatchcase(name, pattern) for pattern in known)]
     if not names:

@@ -13,6 +13,7 @@ from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm, sees_d
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
+from ccnn_torch.units import STANDARD_GRAVITY
 
 REFERENCE = 293.15
 """Temperature at which a machine has its dimensions, ISO 1 [K]."""
@@ -20,7 +21,6 @@ PLATFORM_WEIGHT = 100.0
 """Weight of a platform of which nothing is known [N]."""
 WEIGHTS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 """Weights that a machine may have [N], for weights that act on the joints together with a load that was recorded."""
-_STANDARD = 9.80665
 _SAMPLES = 128
 # Share of the nominal spread below which coordinates that were shown are those of the rows.
 _FAR_LESS = 0.5
@@ -32,7 +32,8 @@ def default_gravity(mechanism: Mechanism) -> Tensor:
     """Along -y for a machine that moves in the x-y plane alone, else along -z; `3` [m/s²], as `Situation` has it."""
     names = {c.name for c in mechanism.pose}
     flat = "z" not in names and {"x", "y"} <= names
-    return torch.tensor([0.0, -_STANDARD if flat else 0.0, 0.0 if flat else -_STANDARD], dtype=torch.float64)
+    down = [0.0, -STANDARD_GRAVITY, 0.0] if flat else [0.0, 0.0, -STANDARD_GRAVITY]
+    return torch.tensor(down, dtype=torch.float64)
 
 
 def has_upright_base(mechanism: Mechanism) -> bool:

@@ -18,7 +18,6 @@ from ccnn_torch.display import number_text
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.evidence.shrink import INTERVAL, Draws, Gap, draws
 from ccnn_torch.motion.effects import Facts, Number, motion_effects
-from ccnn_torch.motion.effects.bodies import STANDARD_GRAVITY
 from ccnn_torch.motion.fit import ALONE, deviations
 from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes, no_worse
@@ -33,6 +32,7 @@ from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.setting import problem_of
 from ccnn_torch.motion.spec import Fit
 from ccnn_torch.motion.stretches import PHASES, Stretches, phases_of
+from ccnn_torch.units import STANDARD_GRAVITY
 
 
 @dataclass(frozen=True)

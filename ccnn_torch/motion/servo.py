@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.effects.bodies import STANDARD_GRAVITY
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.spelling import nearest
+from ccnn_torch.units import STANDARD_GRAVITY
 
 KEYS: dict[str, str] = {
     "gain": "proportional gain; without it torques are told as angles [N*m/rad]",

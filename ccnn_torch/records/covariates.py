@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ccnn_torch.coordinates import Coordinate, is_temperature
 from ccnn_torch.errors import InputError
-from ccnn_torch.records.table import FILE, Table
+from ccnn_torch.records.table import FILE, PAYLOAD, Table
 from ccnn_torch.spelling import hint, nearest
 from ccnn_torch.units import parse_header, si_unit_of, to_si
 
@@ -57,8 +57,9 @@ def choose_covariates(
             notes.append(f"covariate '{name}' is constant ({table.raw(name)[0]:g} {table.units[name]}) and was dropped")
         else:
             covariates.append(coordinate)
-    # The column that numbers several files was added by this package.
-    ignored = [name for name in free if name not in chosen and not (table.parts and name == FILE)]
+    # The column that numbers several files was added by this package, and what a payload weighs is another column.
+    read = ([FILE] if table.parts else []) + ([PAYLOAD] if "load_z" in table else [])
+    ignored = [name for name in free if name not in chosen and name not in read]
     if ignored:
         notes.append(f"ignored columns: {', '.join(ignored)}; name them in covariates to use them as inputs")
     for name in ignored:

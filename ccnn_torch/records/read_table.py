@@ -9,6 +9,7 @@ import re
 import warnings
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -22,8 +23,8 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import read_bytes
 from ccnn_torch.records.formats import Keys, read_form
 from ccnn_torch.records.headers import Header, is_number, read_header
-from ccnn_torch.records.table import Table, name_lines
-from ccnn_torch.units import split_header
+from ccnn_torch.records.table import PAYLOAD, Table, name_lines
+from ccnn_torch.units import STANDARD_GRAVITY, as_read, split_header, to_si
 
 SEPARATORS = ",;\t"
 """What may stand between the cells of a line of text."""
@@ -327,7 +328,31 @@ def _kept(
     """The table of the columns that the header keeps."""
     place = {column: k for k, column in enumerate(header.kept)}
     cells = {(row, place[column]): text for (row, column), text in bad.items() if column in place}
-    return Table(file, header.units, values[:, header.kept], lines, cells, notes=tuple(notes), start=start)
+    return _with_load(Table(file, header.units, values[:, header.kept], lines, cells, notes=tuple(notes), start=start))
+
+
+def _with_load(table: Table) -> Table:
+    """With a column `load_z`, the weight of what a column `payload` has as a mass, where no column has a load."""
+    unit = table.units.get(PAYLOAD, "")
+    if as_read(unit) not in _MASSES or any(name.startswith("load_") for name in table.names):
+        return table
+    number, added = table.names.index(PAYLOAD), len(table.names)
+    weight = -STANDARD_GRAVITY * to_si(table.raw(PAYLOAD), unit, "kg")
+    bad = {(row, added): text for (row, column), text in table.bad_cells.items() if column == number}
+    note = (
+        f"{table.header(PAYLOAD)} counts as load_z, -{STANDARD_GRAVITY:.2f} N a kilogram; where z does not point up, "
+        "write load_x[N] ... in its place"
+    )
+    return replace(
+        table,
+        units=table.units | {"load_z": "N"},
+        values=np.column_stack([table.values, weight]),
+        bad_cells=table.bad_cells | bad,
+        notes=(*table.notes, note),
+    )
+
+
+_MASSES = ("kg", "g", "lb")
 
 
 # What a line without cells is made of.

@@ -20,6 +20,8 @@ from ccnn_torch.units import LARGEST, parse_header, si_unit_of, split_header, to
 
 FILE = "file"
 """The column that numbers the files where there are several: 0, 1, …"""
+PAYLOAD = "payload"
+"""A column that is read as a load where it has a mass, and no other column has a load."""
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add
+from ccnn_torch.units import STANDARD_GRAVITY
 
-STANDARD_GRAVITY = 9.80665
-"""m/s^2."""
 CARRIED = "carried"
 """The parameter of an axis that is the mass at the tool [kg]."""
 # Share of an axis' error that 100 kg at the tool must make for it to show a mass there.
