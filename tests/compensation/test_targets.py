@@ -165,7 +165,7 @@ def test_structured_text_is_parsed_and_gives_the_numbers(arrays: bool, monkeypat
         monkeypatch.setattr(from_model, "_ELEMENTS", 2)
         monkeypatch.setattr(from_model, "_PRODUCTS", 4)
     compensator.secant = arrays
-    form, golden = made(compensator, dtype, sd=False)
+    form, golden = made(compensator, dtype, sd=arrays)
     files = print_structured_text(form, golden)
     assert (" DO" in files["compensator.st"].partition("CCNN_Compensate")[0]) == arrays
     # The parser takes seconds: the test of itself, alike for all models, is read once.
@@ -183,6 +183,10 @@ def test_structured_text_is_parsed_and_gives_the_numbers(arrays: bool, monkeypat
             ideal = Instance(blocks, "CCNN_Ideal", rows)
             ideal(command=golden.joints.T, **more)
             found |= {"ideal": ideal.values["joints"].T, "ideal_status": ideal.values["status"]}
+        if form.sd:
+            spread = Instance(blocks, "CCNN_DeviationSd", rows)
+            spread(command=golden.joints.T, **more)
+            found["sd"] = spread.values["sd"].T
         if arrays:
             test = Instance(blocks, "CCNN_SelfTest", 1)
             test()
