@@ -56,7 +56,7 @@ def test_what_geometry_leaves_is_learned(tmp_path: Path) -> None:
 def test_held_out_rows_do_not_choose(tmp_path: Path) -> None:
     """The figures of the choice are the same whatever the test rows hold."""
     keys = {"effects": ["joint_gain"]}
-    first = _prepared(tmp_path, 3e-4, 1e-4, rows=60, **keys)
+    first = _prepared(tmp_path, 3e-4, 1e-4, rows=40, **keys)
     lines = (tmp_path / "rows.csv").read_text().splitlines()
     for row in first.dataset.splits[0].test.tolist():
         cells = lines[row + 1].split(",")

@@ -131,9 +131,9 @@ def test_identify_reads_records_alike(folder: Path, tmp_path: Path) -> None:
 def test_frames_and_loaded_records_in_python(folder: Path) -> None:
     frame, tripod = pd.read_csv(folder / "whole.csv"), load_mechanism("tripod")
     records = load_records(folder / "whole.csv", tripod)
-    sources: list[Any] = [str(folder / "whole.csv"), folder / "whole.csv", frame, records]
+    sources: list[Any] = [folder / "whole.csv", frame, records]
     tests = [calibrate(records=source, **QUICK).results["methods"]["constant"]["test"] for source in sources]
-    assert tests[1:] == tests[:1] * 3
+    assert tests[1:] == tests[:1] * 2
     with pytest.raises(InputError, match="loaded already"):
         calibrate(records=records, split={"test": str(folder / "later.csv")}, **QUICK)
     verdicts = [diagnose(source, tripod, effects=["geometry"]).verdict for source in (frame, records)]

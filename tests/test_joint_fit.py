@@ -75,11 +75,9 @@ Made = Callable[[Situation], list[Acting]]
     ("made", "there"),
     [
         (lambda s: [], set()),
-        (lambda s: [waves(1.0, 1.5e-4, s)], {"transmission"}),
-        (lambda s: [sagging(s)], {"gravity"}),
         (lambda s: [waves(1.0, 1.5e-4, s), sagging(s)], {"transmission", "gravity"}),
     ],
-    ids=["geometry", "gears", "weight", "both"],
+    ids=["geometry", "both"],
 )
 def test_what_acts_stays_and_the_machine_is_found_to_the_noise(made: Made, there: set[str]) -> None:
     situation = rows(150, 1)

@@ -128,7 +128,7 @@ def test_from_new_to_commands_in_the_count_of_the_controller(
     assert cli("identify", config, "--out", tmp_path / "i", "--quiet", "save_report=false")[0] == 0
     run = ("run", config, "--out", tmp_path / "r", "--quiet", "save_report=false", "methods=[constant]")
     assert cli(*run, "geometry=none", "effects=none")[0] == 0
-    assert cli("plan", config, "--poses", 20, "--out", tmp_path / "p.csv", "--quiet", "candidates=200")[0] == 0
+    assert cli("plan", config, "--poses", 10, "--out", tmp_path / "p.csv", "--quiet", "candidates=50")[0] == 0
     plan = read_table(tmp_path / "p.csv")
     planned, commands = (np.stack([plan.column(f"{w}q{k}") for k in range(1, 7)], -1) for w in ("", "command_"))
     np.testing.assert_allclose(np.degrees(commands), shown_by_fanuc(planned), rtol=1e-12)

@@ -201,7 +201,7 @@ def _replaced(table: pa.Table, name: str, first: list[list[float]]) -> pa.Table:
 
 def test_a_stranger_comes_to_the_right_verdict(tmp_path: Path, cli: Cli, episodes: list[Episode]) -> None:
     (tmp_path / "here").mkdir()
-    write(tmp_path / "here" / "set", episodes[:2])
+    write(tmp_path / "here" / "set", [run(k, 2.6, RATE) for k in range(2)])
     config = tmp_path / "here" / "arm.yaml"
     code, out, error = cli("new", tmp_path / "here" / "set", "--units", "deg", "--out", config)
     assert code == 0, error

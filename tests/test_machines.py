@@ -44,7 +44,7 @@ def test_without_strength_the_machine_is_the_nominal_one(name: str) -> None:
 def test_strength_one_is_a_fraction_of_a_millimetre_and_strength_scales(name: str, cause: str) -> None:
     rms = []
     for strength in (1.0, 2.0):
-        built = machine(name, cause, strength=strength, rows=40)
+        built = machine(name, cause, strength=strength, rows=15)
         rms.append(float(built.mechanism.pose_error(built.reached, built.pose).position.square().mean().sqrt()))
     assert 0.02e-3 < rms[0] < 0.35e-3
     assert rms[1] == pytest.approx(2 * rms[0], rel=0.05)
@@ -197,7 +197,7 @@ def test_the_deviation_is_the_joint_change_that_explains_the_measured_pose(name:
     assert found.dataset.jacobian is not None and found.dataset.jacobian.shape[:2] == (1, 40)
 
 
-@pytest.mark.parametrize("name", ["machine_tool", "arm"])
+@pytest.mark.parametrize("name", ["machine_tool"])
 def test_repeat_k_belongs_to_seed_plus_k_alone(name: str) -> None:
     many = prepared(name, repeats=3, seed=4, split={"kind": "block"})
     alone = prepared(name, repeats=1, seed=6, split={"kind": "block"})
@@ -212,7 +212,7 @@ def test_repeat_k_belongs_to_seed_plus_k_alone(name: str) -> None:
     assert not torch.allclose(many.joints[0], many.joints[1])
 
 
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("name", ["machine_tool"])
 def test_the_expected_floor_is_what_the_noise_makes_on_average(name: str) -> None:
     found = prepared(name, "geometry", repeats=12, realistic={"noise": 1e-5})
     simulation = found.simulation

@@ -169,7 +169,7 @@ def test_planned_poses_are_a_robot_program_too(cli: Cli, tmp_path: Path, languag
     """Joints as the controller counts them, in degrees: a Fanuc-like third joint counts from the horizontal."""
     arm = Path(__file__).parents[1] / "experiments" / "data" / "ur10.yaml"
     out = tmp_path / "7 plan; x.csv"
-    words = ["candidates=60", f"program={language}", 'joint_map={q3: "q3 - q2"}']
+    words = ["candidates=24", f"program={language}", 'joint_map={q3: "q3 - q2"}']
     code, _, err = cli("plan", "--mechanism", arm, "--poses", 12, "--out", out, *words)
     assert code == 0, err
     text = out.with_suffix(suffix).read_text()

@@ -30,6 +30,7 @@ from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.report.json_files import plain
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.study.suite import load_suite
+from ccnn_torch.training.trainer import save_checkpoint
 
 Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent
@@ -216,30 +217,22 @@ def command(*words: str) -> list[str]:
     return [sys.executable, "-m", "ccnn_torch", "run", *words]
 
 
-def stopped(out: Path, keys: list[str], delay: float, number: signal.Signals) -> tuple[int, str]:
-    """Start a run, stop it by a signal `delay` seconds after its first checkpoint; returns exit code and stderr."""
-    process = subprocess.Popen(
-        command(str(TRIPOD), *keys, f"out={out}"),
-        env=ENVIRONMENT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        # A shell starts background jobs with SIGINT ignored, and children inherit that.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+def killed(out: Path, keys: list[str]) -> None:
+    """Start a run and kill it shortly after its first checkpoint."""
+    words = command(str(TRIPOD), *keys, f"out={out}")
+    process = subprocess.Popen(words, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while not list(out.glob("checkpoints/*.safetensors")) and time.monotonic() < deadline:
         time.sleep(0.005)
-    time.sleep(delay)
-    process.send_signal(number)
-    told = process.communicate()[1].decode()
-    assert not (out / "results.json").exists()
-    return process.returncode, told
+    time.sleep(0.05)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL and not (out / "results.json").exists()
 
 
 SHORT_SEARCH = ["ccnn.refinement_iterations=3", "ccnn.waves=2", "ccnn.wave_searches=1"]
 
 
-STOPPED = ["ccnn.generations=40", "ccnn.population=20", "training.checkpoint_every=4", "seed=2", *SHORT_SEARCH]
+STOPPED = ["ccnn.generations=16", "ccnn.population=20", "training.checkpoint_every=4", "seed=2", *SHORT_SEARCH]
 STOPPED += ["training.early_stop=true", "split.validation=0.2", "save_models=false", "save_report=false"]
 
 
@@ -251,22 +244,31 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("number", "delay"), [(signal.SIGINT, 0.0), (signal.SIGKILL, 0.05)])
+@pytest.mark.parametrize("how", ["interrupted", "killed"])
 def test_an_interrupted_or_killed_run_resumes_to_identical_results(
-    cli: Cli, tmp_path: Path, whole: Path, number: signal.Signals, delay: float
+    cli: Cli, tmp_path: Path, whole: Path, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    killed = tmp_path / "killed"
-    code, told = stopped(killed, STOPPED, delay, number)
-    if number == signal.SIGINT:
-        assert code == 130 and told.strip() == "interrupted; what was written so far is kept"
+    stopped = tmp_path / "stopped"
+    if how == "killed":
+        killed(stopped, STOPPED)
     else:
-        assert code == -signal.SIGKILL
-    assert cli("run", "--resume", killed)[0] == 0
+
+        def interrupt(path: Path, *about: Any) -> None:
+            save_checkpoint(path, *about)
+            if about[1]["step"] == 8:
+                signal.raise_signal(signal.SIGINT)
+
+        with monkeypatch.context() as patch:
+            patch.setattr("ccnn_torch.training.trainer.save_checkpoint", interrupt)
+            code, _, told = cli("run", TRIPOD, *STOPPED, f"out={stopped}")
+        assert code == 130 and told.strip() == "interrupted; what was written so far is kept"
+        assert not (stopped / "results.json").exists()
+    assert cli("run", "--resume", stopped)[0] == 0
     for path in (whole / "checkpoints").iterdir():
-        again = load_file(killed / "checkpoints" / path.name)
+        again = load_file(stopped / "checkpoints" / path.name)
         for name, tensor in load_file(path).items():
             assert torch.equal(tensor, again[name]), (path.name, name)
-    one, other = (json.loads((run / "results.json").read_text()) for run in (whole, killed))
+    one, other = (json.loads((run / "results.json").read_text()) for run in (whole, stopped))
     for results in (one, other):
         for method in results["methods"].values():
             del method["seconds"]

@@ -100,11 +100,14 @@ def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor
         `... x 6 x n`, or `... x 3 x n` without rotation; NaN where the frame is.
     """
 
+    turns = False
+
     def flat(x: Tensor) -> Tensor:
+        nonlocal turns
         position, rotation = function(x)
+        turns = rotation is not None
         return position if rotation is None else torch.cat([position, rotation.flatten(-2)], dim=-1)
 
-    turns = function(point)[1] is not None
     value, slope = jacobian_of(flat, point, lambda value: _twist(value, turns))
     return torch.where(torch.isfinite(value).all(-1)[..., None, None], slope, torch.nan)
 

@@ -194,43 +194,41 @@ def _check_jacobians(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
     """By the joints and by the parameters, against central differences of the forward kinematics; the frame's by the
     pose."""
 
-    def by_joints(step: Tensor) -> Tensor:
-        return m.forward_kinematics(joints + step, guess=pose)
+    def by_joints(steps: Tensor) -> Tensor:
+        return m.forward_kinematics(joints + steps, guess=pose.expand(len(steps), -1, -1))
 
-    def by_parameters(step: Tensor) -> Tensor:
-        return m.forward_kinematics(joints, m.nominal + step, guess=pose)
+    def by_parameters(steps: Tensor) -> Tensor:
+        return m.forward_kinematics(joints, m.nominal + steps, guess=pose)
 
     found = {"jacobian": m.jacobian(joints, guess=pose), "jacobian_at": m.jacobian_at(pose, joints)}
-    for name, slopes in found.items():
-        _check_slopes(m, name, slopes, by_joints, [f"joint {j.name}" for j in m.joints], pose)
+    _check_slopes(m, found, by_joints, [f"joint {j.name}" for j in m.joints])
     if len(m.geometry):
         along = [f"parameter {g.name}" for g in m.geometry]
         found = {
             "parameter_jacobian": m.parameter_jacobian(joints, guess=pose),
             "parameter_jacobian_at": m.parameter_jacobian_at(pose, joints),
         }
-        for name, slopes in found.items():
-            _check_slopes(m, name, slopes, by_parameters, along, pose)
+        _check_slopes(m, found, by_parameters, along)
     along = [f"pose coordinate {c.name}" for c in m.pose]
-    _check_slopes(m, "frame_slope", m.frame_slope(pose), lambda step: pose + step, along, pose)
+    _check_slopes(m, {"frame_slope": m.frame_slope(pose)}, lambda steps: pose + steps, along)
 
 
 def _check_slopes(
-    m: Mechanism, name: str, slopes: Tensor, pose_at: Callable[[Tensor], Tensor], along: Sequence[str], pose: Tensor
+    m: Mechanism, found: dict[str, Tensor], pose_at: Callable[[Tensor], Tensor], along: Sequence[str]
 ) -> None:
-    """slopes: `s x c x k`, what `name` returned; pose_at: poses `s x p` at a step `k`; along: names of the k."""
-    rows = 3 if m.frame(pose)[1] is None else 6
-    expected = (len(pose), rows, len(along))
-    _require(slopes.shape == expected, m, f"{name} has shape {tuple(slopes.shape)}, not {expected}")
-    for i, what in enumerate(along):
-        step = torch.zeros(len(along), dtype=torch.float64)
-        step[i] = _STEP
-        ahead, behind = m.frame(pose_at(step)), m.frame(pose_at(-step))
-        slope = (ahead[0] - behind[0]) / (2 * _STEP)
-        if ahead[1] is not None and behind[1] is not None:
-            slope = torch.cat([slope, vee(ahead[1] @ behind[1].mT) / (2 * _STEP)], dim=-1)
-        gap = float(((slopes[..., i] - slope).abs() / (1 + slope.abs())).max())
-        _require(gap <= _SLOPE_TOLERANCE, m, f"{name} is off by {gap:.2g} for {what}")
+    """found: slopes `s x c x k` by the name of what returned them; pose_at: poses `k x s x p` at steps `k x 1 x k`;
+    along: names of the k."""
+    steps = _STEP * torch.eye(len(along), dtype=torch.float64)[:, None]
+    ahead, behind = m.frame(pose_at(steps)), m.frame(pose_at(-steps))
+    wanted = (ahead[0] - behind[0]) / (2 * _STEP)
+    if ahead[1] is not None and behind[1] is not None:
+        wanted = torch.cat([wanted, vee(ahead[1] @ behind[1].mT) / (2 * _STEP)], dim=-1)
+    wanted = wanted.movedim(0, -1)
+    for name, slopes in found.items():
+        _require(slopes.shape == wanted.shape, m, f"{name} has shape {tuple(slopes.shape)}, not {tuple(wanted.shape)}")
+        gaps = ((slopes - wanted).abs() / (1 + wanted.abs())).amax((0, 1)).tolist()
+        for gap, what in zip(gaps, along, strict=True):
+            _require(gap <= _SLOPE_TOLERANCE, m, f"{name} is off by {gap:.2g} for {what}")
 
 
 def _check_hooks(m: Mechanism, joints: Tensor, pose: Tensor) -> None:

@@ -197,7 +197,6 @@ def _reversed_second(joints: Tensor) -> Tensor:
 @pytest.mark.parametrize(
     ("joints", "pose", "said"),
     [
-        (_same, lambda pose: 1000 * pose, "the pose's lengths seem to be in millimetres under m"),
         (_same, lambda pose: pose.roll(1, 0), "the poses seem to be one row late"),
         (_reversed_second, _same, "joint q2 seems to count in the other direction"),
     ],

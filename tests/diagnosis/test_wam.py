@@ -22,7 +22,7 @@ def test_the_approach_is_named_only_with_its_own_directions(dealt: bool) -> None
     records = load_records(DATA / "wam.csv", arm)
     order = torch.randperm(len(records), generator=torch.Generator().manual_seed(0)) if dealt else slice(None)
     records = replace(records, covariates=records.covariates[order])
-    found = diagnose(records, arm, effects=[*APPROACH, "geometry", "joint_gain", "gravity"])
+    found = diagnose(records, arm, effects=[*APPROACH, "joint_gain", "gravity"])
     assert bool(APPROACH & set(found.verdict["effects"])) != dealt, found.verdict["text"]
     assert found.gap["after"] < 0.55 * found.gap["before"]
     if not dealt:

@@ -35,7 +35,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     count = metafunc.config.getoption("--fuzz-cases")
     inner = getattr(metafunc.function, "hypothesis", None)
     if inner is not None:
-        few = getattr(metafunc.module, "CASES", 20)
+        few = getattr(metafunc.module, "CASES", 8)
         metafunc.function._hypothesis_internal_use_settings = settings(
             max_examples=max(few, 1) if count is None else count,
             phases=[Phase.explicit] if count is None and few == 0 else [*Phase],

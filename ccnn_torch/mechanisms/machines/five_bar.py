@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -29,6 +32,15 @@ def inscribed_circle(crank: Tensor, coupler: Tensor, foot: Tensor) -> tuple[Tens
     Returns:
         Centre, `2` [m], and radius, `` [m].
     """
+    numbers = (tuple(crank.tolist()), tuple(coupler.tolist()), tuple(map(tuple, foot.tolist())))
+    x, y, radius = _inscribed_circle(*numbers)
+    return crank.new_tensor([x, y]), crank.new_tensor(radius)
+
+
+@lru_cache(maxsize=64)
+def _inscribed_circle(*numbers: tuple[Any, ...]) -> tuple[float, float, float]:
+    """x, y and radius; most five-bars of a process have the same lengths."""
+    crank, coupler, foot = (torch.tensor(part, dtype=torch.float64) for part in numbers)
     edge = _couplers_in_line(crank, coupler, foot)
     size = (crank + coupler).amin()
     centre, half = foot.mean(0) + torch.stack([torch.zeros_like(size), size / 2]), size
@@ -47,7 +59,7 @@ def inscribed_circle(crank: Tensor, coupler: Tensor, foot: Tensor) -> tuple[Tens
         # The margin rises by no more than the way gone: farther edge points cannot be the nearest any more.
         near = torch.linalg.vector_norm(edge - centre, dim=-1) < margin[best] + 3 * half
         edge = edge[near]
-    return centre, margin[best]
+    return float(centre[0]), float(centre[1]), float(margin[best])
 
 
 def _margin(points: Tensor, crank: Tensor, coupler: Tensor, foot: Tensor, edge: Tensor) -> Tensor:
