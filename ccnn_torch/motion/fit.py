@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ccnn_torch.evidence.dictionary import CERTAIN
 from ccnn_torch.evidence.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_variance
-from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, scaled
+from ccnn_torch.evidence.marginal_likelihood import JITTER, Fits, Grams, fit_sets, scaled
 from ccnn_torch.motion.descent import Point, descended, lots, padded, renew, sensitivities
 from ccnn_torch.motion.effects import EXACT
 from ccnn_torch.motion.problem import Problem
@@ -89,6 +89,9 @@ def _fits_of(
 ) -> list[Fit]:
     """The evidence of models linearised at the `theta` of their sets.
 
+    What a linear model would take of the residual beyond that counts as left: the fit has tried that, and found a bound
+    there, or that the model is not linear so far.
+
     Args:
         specs: `p` sets.
         residual, columns, nuisance: whitened, `p x v`, `p x m x v` and `p x k x v`.
@@ -106,15 +109,20 @@ def _fits_of(
     ]
     # Runs of one stretch each have no parts.
     once = shares if int(folds[1].max()) > 0 else [0.0] * len(specs)
-    y = residual + (own[:, None] @ x)[:, 0]
+    inner = x @ x.mT
+    least = 1 - real + JITTER * inner.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).clamp_min(1.0)
+    more = torch.linalg.solve(inner + torch.diag_embed(least), x @ residual[..., None])
+    promised = (more.mT @ x)[:, 0]
+    y = residual - promised + (own[:, None] @ x)[:, 0]
     grams, beside = products(nuisance, x, y, values), nuisance.shape[1]
+    grams = grams._replace(yy=grams.yy + promised.square().sum(-1))
     found = weighed(grams, beside, groups, None)
     unseen = y.new_zeros(len(specs))
     for within, fold in enumerate(folds):
         those = torch.tensor([k for k, share in enumerate(once) if (share > _ONCE) == within], dtype=torch.int64)
         if len(those):
             some = Fits(*(value[those] for value in found))
-            unseen[those] = squares_unseen(x[those], y[those], some, [groups[k] for k in those.tolist()], fold)
+            unseen[those] = promised[those].square().sum(-1) + squares_unseen(x[those], y[those], some, [groups[k] for k in those.tolist()], fold)
     return [
         Fit(
             spec,
@@ -164,9 +172,11 @@ def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Sequence[Te
         fold: of each value, `v`.
     """
     ridge = torch.ones_like(x[..., 0])
+    # What acts in one fold alone leaves nothing for the others.
+    least = JITTER * x.square().sum(-1)
     for k, own in enumerate(groups):
         for g, columns in enumerate(own):
-            ridge[k, columns] = torch.exp(-fit.log_scale[k, g]) * fit.noise[k]
+            ridge[k, columns] = torch.exp(-fit.log_scale[k, g]) * fit.noise[k] + least[k, columns]
     if int(fold.max()) == 0:
         return (y - (fit.mean[:, None, : x.shape[1]] @ x)[:, 0]).square().sum(-1)
     whole, along, found = x @ x.mT + torch.diag_embed(ridge), x @ y[..., None], torch.zeros_like(y[:, 0])
@@ -192,18 +202,23 @@ def form_errors(
     # Of a model each of whose values was told how well it is known, that is all that it may be off by.
     is_told = problem.unsure and problem.unsure.keys() <= problem.known.keys()
     nominal = 0.0 if is_told else _OF_NOMINAL
-    command, names = problem.data.command, problem.library.names
+    command = problem.data.command
     does, most = (
         problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
         for v in (problem.positions(problem.nothing, problem.axes), problem.data.position)
     )
 
     def of_set(axis: int, fit: Fit) -> float:
-        shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in fit.members]
+        shares = form_shares(problem, fit.members)
         energy = weighed(fit.grams, nuisance.shape[1], [fit.spec.groups], None).energy[0].tolist()[: len(shares)]
         return form_variance([*shares, nominal], [*energy, does[axis]], max(most[axis], does[axis]))
 
     return [max(min(of_set(i, fit) for fit in own), least[i]) for i, own in enumerate(best)]
+
+
+def form_shares(problem: Problem, members: Sequence[int]) -> list[float]:
+    """Share φ of each effect's squares that its form error adds to the noise."""
+    return [OF_EXACT if problem.library.names[m] in EXACT else OF_FORM for m in members]
 
 
 def weighed(grams: Grams, beside: int, sets: Sequence[Sequence[Tensor]], variance: float | None) -> Fits:

@@ -15,14 +15,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy.interpolate import BSpline
 from torch import Tensor
 
-from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH, share_of_exact
+from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH, lacking, share_of_exact
 from ccnn_torch.evidence.judge import judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams
-from ccnn_torch.motion.descent import sensitivities
-from ccnn_torch.motion.fit import products, side_by_side, squares_unseen, weighed
+from ccnn_torch.motion.descent import free, sensitivities
+from ccnn_torch.motion.fit import form_shares, products, side_by_side, squares_unseen, weighed
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, prior_of
 from ccnn_torch.motion.spec import Fit, Spec
@@ -140,7 +142,12 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver], above: float) -
     by_members = {f.members: f for f in fits}
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
-    sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f)) for f in fits]
+    sets = [
+        Candidate(
+            essential(f.members, left, unseen), (), f.grams, f.spec.groups, form_shares(problem, f.members), prior_of(f)
+        )
+        for f in fits
+    ]
     sets += with_drivers(found, axis, drivers, by_members)
     twins, beside, noise = problem.library.twins, found.nuisance.shape[1], fits[0].noise
 
@@ -212,9 +219,16 @@ def _weights(sets: Sequence[Candidate], nuisance: int, noise: float, form: float
     more than that share of what the driver does.
     """
 
+    grams = side_by_side(sets)
+
     def under(variance: float) -> list[float]:
-        evidence = weighed(side_by_side(sets), nuisance, [one.groups for one in sets], variance).log_evidence.tolist()
-        return [found + one.log_prior for found, one in zip(evidence, sets, strict=True)]
+        found = weighed(grams, nuisance, [one.groups for one in sets], variance)
+        parts = found.mean.square() * grams.xx.diagonal(dim1=-2, dim2=-1)[:, nuisance:] / variance
+        each = zip(found.log_evidence.tolist(), parts, (grams.yy / variance).tolist(), sets, strict=True)
+        return [
+            evidence + one.log_prior - lacking(one.forms, [float(own[g].sum()) for g in one.groups], most)
+            for evidence, own, most, one in each
+        ]
 
     weights = under(noise + form)
     best = sets[weights.index(max(weights))]
@@ -240,7 +254,7 @@ class Candidate(NamedTuple):
     Attributes:
         members: those that do something.
         drivers: what a term beside them follows; () = there is none, or it does next to nothing.
-        grams, groups, log_prior: of its model linearised.
+        grams, groups, forms, log_prior: of its model linearised; forms: share φ of each group's form error.
         rows: with a driver, whitened columns of members and driver, `m x v` each, and what they explain, `v`.
     """
 
@@ -248,6 +262,7 @@ class Candidate(NamedTuple):
     drivers: tuple[str, ...]
     grams: Grams
     groups: list[Tensor]
+    forms: list[float]
     log_prior: float
     rows: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -295,17 +310,19 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     )
     residual, columns = sensitivities(problem, found.whitening, theta, at, places)
     # Of the position itself, not of its whitened form.
+    # A number at an end of what it may be stays there.
+    columns = columns * free(problem, theta, at, places)[..., None]
     left_plain, columns_plain = sensitivities(problem, plainly, theta, at, places)
     sets: list[tuple[int, Candidate]] = []
     for b, base in enumerate(bases):
         own = columns[b, : len(places[b])]
         y = residual[b] + theta[b, list(places[b])] @ own
-        prior = prior_of(base, drivers=1)
+        prior, forms = prior_of(base, drivers=1), [*form_shares(problem, base.members), OF_SMOOTH]
         for k, (driver, beside) in enumerate(zip(drivers, white, strict=True)):
             x = torch.cat([own, beside])
             grams = products(found.nuisance[axis], x, y, values)
             groups = [*base.spec.groups, torch.arange(len(own), len(x))]
-            sets.append((k, Candidate(base.members, (driver.name,), grams, groups, prior, (own, beside, y))))
+            sets.append((k, Candidate(base.members, (driver.name,), grams, groups, forms, prior, (own, beside, y))))
     each = [one for _, one in sets]
     means = weighed(side_by_side(each), found.nuisance.shape[1], [one.groups for one in each], None).mean
     for n, (k, one) in enumerate(sets):
@@ -359,15 +376,15 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
     # An axis that follows exactly has no torque, and what rounding leaves of it has the sign of the speed.
     span = (data.position.amax((-1, -2)) - data.position.amin((-1, -2)))[:, None, None, None]
     loaded = error.abs().amax((-1, -2))[:, None, None, None] > _LOADED * span
-    place, over = _hats(moved, data.judged, True), _over_time(problem)
+    place, over = _smooth(moved, data.judged, True), _over_time(problem)
     sign = direction(speed, speed.abs().mean((-1, -2), keepdim=True))[:, None]
-    fast = _hats(speed, data.judged)
+    fast = _smooth(speed, data.judged)
     direct = {
         "speed": fast,
-        "acceleration": _hats(acceleration, data.judged),
+        "acceleration": _smooth(acceleration, data.judged),
         "reversal": _fading(speed, data.time),
         "position": place,
-        "torque": _hats(error, data.judged) * loaded,
+        "torque": _smooth(error, data.judged) * loaded,
         # A constant of its own: what drifts begins somewhere.
         "time": torch.cat([torch.ones_like(over[:, :1]), over], 1),
     }
@@ -390,19 +407,19 @@ def _slope(values: Tensor, step: Tensor) -> Tensor:
     return torch.cat([slope[..., :1], slope], -1)
 
 
-def _hats(driver: Tensor, judged: Tensor, is_even: bool = False) -> Tensor:
-    """Piecewise linear functions, `n x m x b x s`, with their knots at quantiles, or evenly spaced."""
+def _smooth(driver: Tensor, judged: Tensor, is_even: bool = False) -> Tensor:
+    """Cubic B-splines, `n x m x b x s`, with their knots at quantiles, or evenly spaced."""
     share = torch.linspace(*((0, 1, _EVENLY) if is_even else (*_ENDS, _KNOTS)), dtype=driver.dtype)
-    found = driver.new_zeros(len(driver), len(share), *driver.shape[1:])
-    for hats, one in zip(found, driver, strict=True):
+    found = driver.new_zeros(len(driver), len(share) + 2, *driver.shape[1:])
+    for splines, one in zip(found, driver, strict=True):
         some = one[judged]
         even = some.min() + share * (some.max() - some.min())
-        knots = torch.unique(even if is_even else torch.quantile(some, share))
+        knots = torch.unique(even if is_even else torch.quantile(some, share)).numpy()
         if len(knots) > 2:
-            place = (torch.searchsorted(knots, one.contiguous()) - 1).clamp(0, len(knots) - 2)
-            within = ((one - knots[place]) / (knots[place + 1] - knots[place])).clamp(0, 1)
-            hats.scatter_(0, place[None], (1 - within)[None])
-            hats.scatter_(0, place[None] + 1, within[None])
+            ends = np.concatenate([knots[:1].repeat(3), knots, knots[-1:].repeat(3)])
+            at = one.flatten().numpy().clip(knots[0], knots[-1])
+            values = BSpline.design_matrix(at, ends, 3).toarray()
+            splines[: values.shape[1]] = torch.from_numpy(values.T).reshape(-1, *one.shape)
     return found
 
 
@@ -426,4 +443,4 @@ def _over_time(problem: Problem) -> Tensor:
         mine = data.run == run
         ends = data.time[mine][data.judged[mine]]
         share[mine] = ((data.time[mine] - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)).clamp(0, 1)
-    return _hats(share[None], data.judged, True).expand(len(problem.axes), -1, -1, -1)
+    return _smooth(share[None], data.judged, True).expand(len(problem.axes), -1, -1, -1)
