@@ -24,8 +24,10 @@ LEVELS = (1.0, 0.25, 4.0)
 """Levels of the form error, equally probable: it is known to a factor of four or so."""
 # Standard deviations of the noise's mean square that a remainder must exceed in any case; and within which it is none.
 _CLEARLY, _SLIGHTLY = 5.0, 3.0
-# Log prior odds that all forms are those of the textbook, and directions in which a form error is sure to show.
-_LOG_EXACT = math.log(0.001)
+RARELY = math.log(0.03)
+"""Log prior odds that a form is that of the textbook."""
+# The same of two of them, and directions in which a form error is sure to show.
+_LOG_EXACT = 2 * RARELY
 _SEEN = 6
 
 

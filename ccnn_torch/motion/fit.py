@@ -15,6 +15,7 @@ from ccnn_torch.evidence.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_v
 from ccnn_torch.evidence.marginal_likelihood import JITTER, Fits, Grams, fit_sets, scaled
 from ccnn_torch.motion.descent import Point, descended, lots, padded, renew, sensitivities
 from ccnn_torch.motion.effects import EXACT
+from ccnn_torch.motion.known import VALUE
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.spec import Fit, Spec
 from ccnn_torch.motion.whiten import Whitening
@@ -199,9 +200,8 @@ def form_errors(
         best: sets of each axis, none of which is clearly the best: the one whose forms are known best counts.
         least: the variance of each axis is at least that.
     """
-    # Of a model each of whose values was told how well it is known, that is all that it may be off by.
-    is_told = problem.unsure and problem.unsure.keys() <= problem.known.keys()
-    nominal = 0.0 if is_told else _OF_NOMINAL
+    # The form of a model is known the better, the better its least known value is.
+    nominal = _OF_NOMINAL * min(max(problem.unsure.values(), default=VALUE) / VALUE, 1.0) ** 2
     command = problem.data.command
     does, most = (
         problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
@@ -261,23 +261,12 @@ def side_by_side(models: Sequence[HasGrams]) -> Grams:
 
 
 def deviations(fits: Sequence[Fit], beside: int, variances: Sequence[float]) -> list[Tensor]:
-    """Standard deviations of the numbers of sets, `m` in plausible sizes each, under noises that hold form errors too.
-
-    The values of the nominal model, `beside` columns, are taken for exact here.
-    """
-    if not fits:
-        return []
-    grams = side_by_side(fits)
-    noise = torch.tensor([max(v, fit.noise) for v, fit in zip(variances, fits, strict=True)], dtype=grams.yy.dtype)
-    own = Grams(
-        grams.xx[:, beside:, beside:] / noise[:, None, None],
-        grams.xy[:, beside:] / noise[:, None],
-        grams.yy / noise,
-        grams.values,
-    )
-    found = fit_sets(own, [fit.spec.groups for fit in fits], CERTAIN * own.values)
-    spread = found.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-    return [sd[: len(fit.spec.flat)] for sd, fit in zip(spread, fits, strict=True)]
+    """Standard deviations of the numbers of sets, `m` in plausible sizes each, under noises that hold form errors too."""
+    each = [
+        weighed(fit.grams, beside, [fit.spec.groups], max(variance, fit.noise)).covariance[0]
+        for fit, variance in zip(fits, variances, strict=True)
+    ]
+    return [own.diagonal().clamp_min(0).sqrt() for own in each]
 
 
 def unseen_errors(found: Sequence[Sequence[Fit]]) -> list[float]:

@@ -20,8 +20,8 @@ import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
 
-from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH, lacking, share_of_exact
-from ccnn_torch.evidence.judge import judge, marginal, posterior
+from ccnn_torch.evidence.form_error import DIRECTIONS, LEVELS, OF_SMOOTH, RARELY, lacking, share_of_exact
+from ccnn_torch.evidence.judge import Explanation, judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams
 from ccnn_torch.motion.descent import free, sensitivities
 from ccnn_torch.motion.fit import form_shares, products, side_by_side, squares_unseen, weighed
@@ -137,8 +137,8 @@ def _above_white(problem: Problem, specs: Sequence[Spec]) -> list[float]:
     return ratio
 
 
-def _judged(found: Search, axis: int, drivers: Sequence[Driver], above: float) -> AxisVerdict:
-    problem, fits = found.problem, found.found[axis]
+def _judged(search: Search, axis: int, drivers: Sequence[Driver], above: float) -> AxisVerdict:
+    problem, fits = search.problem, search.found[axis]
     by_members = {f.members: f for f in fits}
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
@@ -148,11 +148,11 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver], above: float) -
         )
         for f in fits
     ]
-    sets += with_drivers(found, axis, drivers, by_members)
-    twins, beside, noise = problem.library.twins, found.nuisance.shape[1], fits[0].noise
+    sets += with_drivers(search, axis, drivers, by_members)
+    twins, beside, noise = problem.library.twins, search.nuisance.shape[1], fits[0].noise
 
     def named(level: float) -> list[Named]:
-        weights = _weights(sets, beside, noise, level * found.form[axis], level * OF_SMOOTH)
+        weights = _weights(sets, beside, noise, level * search.form[axis], level * OF_SMOOTH)
         return [
             (names, one.drivers, w, one)
             for w, one in zip(weights, sets, strict=True)
@@ -161,15 +161,25 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver], above: float) -
 
     # What an effect makes of the logs has no form error where white noise is all that is left.
     every = named(0.0)
-    exact = [one for one in every if not one[1]]
+    # Each further name has to have its exact form as well.
+    exact = [(names, (), w + RARELY * max(len(names) - 2, 0), one) for names, drivers, w, one in every if not drivers]
     beaten = max(w for *_, w, _ in every) - max(w for *_, w, _ in exact)
-    share = share_of_exact(above, above, 1 + found.form[axis] / noise, problem.values, beaten)
+    share = share_of_exact(above, above, 1 + search.form[axis] / noise, problem.values, beaten)
     explanations = posterior([(share, exact), *(((1 - share) / len(LEVELS), named(level)) for level in LEVELS)])
-    verdict = judge(explanations, explanations, of_classes=True)
+
+    def rest_of(one: Explanation[Candidate]) -> tuple[str, ...] | None:
+        """What the remainder of an explanation follows, where that is more than the noise and form errors."""
+        found = weighed(one.best.grams, beside, [one.best.groups], noise)
+        more = noise * (float(found.rss) - problem.values)
+        if more <= max(noise * _CLEARLY**2 * math.sqrt(2 * problem.values), DIRECTIONS * search.form[axis]):
+            return None
+        return next((e.drivers for e in explanations if e.drivers and e.names == one.names), ())
+
+    verdict = judge(explanations, explanations, rest_of, of_classes=True)
     best, classes = least_unseen(by_members, verdict.chosen.best.members, verdict.classes)
     hidden, doubted = None, False
     probability = verdict.probability
-    if verdict.outside and not holds(problem, verdict.chosen.best, beside):
+    if verdict.outside and verdict.chosen.drivers and not holds(problem, verdict.chosen.best, beside):
         probability = min(probability, _UNCONFIRMED)
     most = _CLEARLY**2 * fits[0].rss
     if not best.members and not verdict.outside and best.rss > most:
@@ -178,7 +188,7 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver], above: float) -
         hidden = min(alone, key=lambda f: _after_nuisance(f, noise)).members[0]
         doubted = _after_nuisance(best, noise) > most
     marginals = {e: marginal(explanations, e) for e in {*(e for f in fits for e in f.members), *twins}}
-    driver = verdict.drivers[0] if verdict.outside else None
+    driver = next(iter(verdict.drivers), None) if verdict.outside else None
     return AxisVerdict(best, probability, marginals, classes, driver, hidden, doubted)
 
 
