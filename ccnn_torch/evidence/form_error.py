@@ -121,26 +121,13 @@ def _at_level(dictionary: Dictionary, best: FittedSet, floor: float, level: floa
 
 
 def _lacking(dictionary: Dictionary, found: FittedSet, level: float) -> float:
-    squares = dictionary.grams.xx.diagonal()
-    parts = [
-        float(mean.square() @ squares[dictionary.groups[i]])
-        for i, mean in zip(found.members, found.mean, strict=True)
-    ]
-    shares = [level * dictionary.atoms[i].form_error for i in found.members]
-    return lacking(shares, parts, float(dictionary.grams.yy))
-
-
-def lacking(shares: Sequence[float], parts: Sequence[float], most: float) -> float:
     """Log odds against parts that nearly cancel each other: what their forms are wrong by would not cancel, and none of
-    it is left.
-
-    Args:
-        shares: φ of each.
-        parts: squares of each, in units of the variance of noise and form errors.
-        most: squares of all there is, in the same units.
-    """
-    beyond = sum(share * max(part - most, 0.0) for share, part in zip(shares, parts, strict=True))
-    return _SEEN / 2 * math.log1p(beyond)
+    it is left."""
+    yy, squares, beyond = float(dictionary.grams.yy), dictionary.grams.xx.diagonal(), 0.0
+    for i, mean in zip(found.members, found.mean, strict=True):
+        parts = float(mean.square() @ squares[dictionary.groups[i]])
+        beyond += dictionary.atoms[i].form_error * max(parts - yy, 0.0)
+    return _SEEN / 2 * math.log1p(level * beyond)
 
 
 def _without_discrepancies(posterior: Posterior) -> Posterior:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -123,7 +122,8 @@ def _fits_of(
         those = torch.tensor([k for k, share in enumerate(once) if (share > _ONCE) == within], dtype=torch.int64)
         if len(those):
             some = Fits(*(value[those] for value in found))
-            unseen[those] = promised[those].square().sum(-1) + squares_unseen(x[those], y[those], some, [groups[k] for k in those.tolist()], fold)
+            unseen[those] = promised[those].square().sum(-1)
+            unseen[those] += squares_unseen(x[those], y[those], some, [groups[k] for k in those.tolist()], fold)
     return [
         Fit(
             spec,
@@ -202,23 +202,18 @@ def form_errors(
     """
     # The form of a model is known the better, the better its least known value is.
     nominal = _OF_NOMINAL * min(max(problem.unsure.values(), default=VALUE) / VALUE, 1.0) ** 2
-    command = problem.data.command
+    command, names = problem.data.command, problem.library.names
     does, most = (
         problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
         for v in (problem.positions(problem.nothing, problem.axes), problem.data.position)
     )
 
     def of_set(axis: int, fit: Fit) -> float:
-        shares = form_shares(problem, fit.members)
+        shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in fit.members]
         energy = weighed(fit.grams, nuisance.shape[1], [fit.spec.groups], None).energy[0].tolist()[: len(shares)]
         return form_variance([*shares, nominal], [*energy, does[axis]], max(most[axis], does[axis]))
 
     return [max(min(of_set(i, fit) for fit in own), least[i]) for i, own in enumerate(best)]
-
-
-def form_shares(problem: Problem, members: Sequence[int]) -> list[float]:
-    """Share φ of each effect's squares that its form error adds to the noise."""
-    return [OF_EXACT if problem.library.names[m] in EXACT else OF_FORM for m in members]
 
 
 def weighed(grams: Grams, beside: int, sets: Sequence[Sequence[Tensor]], variance: float | None) -> Fits:
@@ -241,16 +236,8 @@ def weighed(grams: Grams, beside: int, sets: Sequence[Sequence[Tensor]], varianc
     return fit_sets(own, sets, CERTAIN * own.values)
 
 
-class HasGrams(Protocol):
-    """What is weighed beside others."""
-
-    @property
-    def grams(self) -> Grams: ...
-
-
-def side_by_side(models: Sequence[HasGrams]) -> Grams:
+def side_by_side(each: Sequence[Grams]) -> Grams:
     """Inner products of `p` models as those of one batch, padded with 0 to the widest."""
-    each = [model.grams for model in models]
     widest = max(len(own.xy) for own in each)
 
     def wide(values: Tensor) -> Tensor:
@@ -261,7 +248,7 @@ def side_by_side(models: Sequence[HasGrams]) -> Grams:
 
 
 def deviations(fits: Sequence[Fit], beside: int, variances: Sequence[float]) -> list[Tensor]:
-    """Standard deviations of the numbers of sets, `m` in plausible sizes each, under noises that hold form errors too."""
+    """Standard deviations of the numbers of sets, `m` plausible sizes each, under noises that hold form errors too."""
     each = [
         weighed(fit.grams, beside, [fit.spec.groups], max(variance, fit.noise)).covariance[0]
         for fit, variance in zip(fits, variances, strict=True)

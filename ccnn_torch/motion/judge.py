@@ -20,11 +20,11 @@ import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
 
-from ccnn_torch.evidence.form_error import DIRECTIONS, LEVELS, OF_SMOOTH, RARELY, lacking, share_of_exact
+from ccnn_torch.evidence.form_error import DIRECTIONS, LEVELS, OF_SMOOTH, RARELY, share_of_exact
 from ccnn_torch.evidence.judge import Explanation, judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams
 from ccnn_torch.motion.descent import free, sensitivities
-from ccnn_torch.motion.fit import form_shares, products, side_by_side, squares_unseen, weighed
+from ccnn_torch.motion.fit import products, side_by_side, squares_unseen, weighed
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, prior_of
 from ccnn_torch.motion.spec import Fit, Spec
@@ -142,12 +142,7 @@ def _judged(search: Search, axis: int, drivers: Sequence[Driver], above: float) 
     by_members = {f.members: f for f in fits}
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
-    sets = [
-        Candidate(
-            essential(f.members, left, unseen), (), f.grams, f.spec.groups, form_shares(problem, f.members), prior_of(f)
-        )
-        for f in fits
-    ]
+    sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f)) for f in fits]
     sets += with_drivers(search, axis, drivers, by_members)
     twins, beside, noise = problem.library.twins, search.nuisance.shape[1], fits[0].noise
 
@@ -167,10 +162,13 @@ def _judged(search: Search, axis: int, drivers: Sequence[Driver], above: float) 
     share = share_of_exact(above, above, 1 + search.form[axis] / noise, problem.values, beaten)
     explanations = posterior([(share, exact), *(((1 - share) / len(LEVELS), named(level)) for level in LEVELS)])
 
+    def left_by(grams: Grams, groups: list[Tensor]) -> float:
+        """Squares that a set leaves, nominal values and time stamps being off as is likely."""
+        return noise * float(weighed(grams, beside, [groups], noise).rss)
+
     def rest_of(one: Explanation[Candidate]) -> tuple[str, ...] | None:
         """What the remainder of an explanation follows, where that is more than the noise and form errors."""
-        found = weighed(one.best.grams, beside, [one.best.groups], noise)
-        more = noise * (float(found.rss) - problem.values)
+        more = left_by(one.best.grams, one.best.groups) - noise * problem.values
         if more <= max(noise * _CLEARLY**2 * math.sqrt(2 * problem.values), DIRECTIONS * search.form[axis]):
             return None
         return next((e.drivers for e in explanations if e.drivers and e.names == one.names), ())
@@ -185,8 +183,8 @@ def _judged(search: Search, axis: int, drivers: Sequence[Driver], above: float) 
     if not best.members and not verdict.outside and best.rss > most:
         # Not what a value that is known no better explains as well.
         alone = (f for f in fits if len(f.members) == 1)
-        hidden = min(alone, key=lambda f: _after_nuisance(f, noise)).members[0]
-        doubted = _after_nuisance(best, noise) > most
+        hidden = min(alone, key=lambda f: left_by(f.grams, f.spec.groups)).members[0]
+        doubted = left_by(best.grams, []) > most
     marginals = {e: marginal(explanations, e) for e in {*(e for f in fits for e in f.members), *twins}}
     driver = next(iter(verdict.drivers), None) if verdict.outside else None
     return AxisVerdict(best, probability, marginals, classes, driver, hidden, doubted)
@@ -215,13 +213,6 @@ def least_unseen(
     return best, told
 
 
-def _after_nuisance(fit: Fit, noise: float) -> float:
-    """Squares that a set leaves, its numbers being plausible, and nominal values and time stamps off as is likely."""
-    xx, xy = fit.grams.xx, fit.grams.xy
-    inner = xx + noise * torch.eye(len(xx), dtype=xx.dtype)
-    return float(fit.grams.yy - xy @ torch.linalg.solve(inner, xy))
-
-
 def _weights(sets: Sequence[Candidate], nuisance: int, noise: float, form: float, smooth: float) -> list[float]:
     """Log posterior of each set under noise and form errors, not normalised; nuisance: how many columns it has.
 
@@ -229,16 +220,11 @@ def _weights(sets: Sequence[Candidate], nuisance: int, noise: float, form: float
     more than that share of what the driver does.
     """
 
-    grams = side_by_side(sets)
+    grams = side_by_side([one.grams for one in sets])
 
     def under(variance: float) -> list[float]:
-        found = weighed(grams, nuisance, [one.groups for one in sets], variance)
-        parts = found.mean.square() * grams.xx.diagonal(dim1=-2, dim2=-1)[:, nuisance:] / variance
-        each = zip(found.log_evidence.tolist(), parts, (grams.yy / variance).tolist(), sets, strict=True)
-        return [
-            evidence + one.log_prior - lacking(one.forms, [float(own[g].sum()) for g in one.groups], most)
-            for evidence, own, most, one in each
-        ]
+        found = weighed(grams, nuisance, [one.groups for one in sets], variance).log_evidence.tolist()
+        return [evidence + one.log_prior for evidence, one in zip(found, sets, strict=True)]
 
     weights = under(noise + form)
     best = sets[weights.index(max(weights))]
@@ -264,7 +250,7 @@ class Candidate(NamedTuple):
     Attributes:
         members: those that do something.
         drivers: what a term beside them follows; () = there is none, or it does next to nothing.
-        grams, groups, forms, log_prior: of its model linearised; forms: share φ of each group's form error.
+        grams, groups, log_prior: of its model linearised.
         rows: with a driver, whitened columns of members and driver, `m x v` each, and what they explain, `v`.
     """
 
@@ -272,7 +258,6 @@ class Candidate(NamedTuple):
     drivers: tuple[str, ...]
     grams: Grams
     groups: list[Tensor]
-    forms: list[float]
     log_prior: float
     rows: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -327,14 +312,14 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     for b, base in enumerate(bases):
         own = columns[b, : len(places[b])]
         y = residual[b] + theta[b, list(places[b])] @ own
-        prior, forms = prior_of(base, drivers=1), [*form_shares(problem, base.members), OF_SMOOTH]
+        prior = prior_of(base, drivers=1)
         for k, (driver, beside) in enumerate(zip(drivers, white, strict=True)):
             x = torch.cat([own, beside])
             grams = products(found.nuisance[axis], x, y, values)
             groups = [*base.spec.groups, torch.arange(len(own), len(x))]
-            sets.append((k, Candidate(base.members, (driver.name,), grams, groups, forms, prior, (own, beside, y))))
-    each = [one for _, one in sets]
-    means = weighed(side_by_side(each), found.nuisance.shape[1], [one.groups for one in each], None).mean
+            sets.append((k, Candidate(base.members, (driver.name,), grams, groups, prior, (own, beside, y))))
+    grams = side_by_side([one.grams for _, one in sets])
+    means = weighed(grams, found.nuisance.shape[1], [one.groups for _, one in sets], None).mean
     for n, (k, one) in enumerate(sets):
         b = n // len(drivers)
         m = len(places[b])
