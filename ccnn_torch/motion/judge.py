@@ -38,7 +38,7 @@ _UNCONFIRMED, _CLEARLY = 0.5, 3.0
 _BASES = 6
 # Share of what is left of runs that were not fitted up to which a set without a member is as good.
 _NEARLY = 1.02
-# Knots of a piecewise linear function: at quantiles of a driver, and evenly spaced ones of a position and of the time.
+# Knots of a cubic spline: at quantiles of a driver, and evenly spaced ones of a position and of the time.
 _KNOTS, _EVENLY = 7, 9
 # Time constants of what fades after a reversal [s].
 _FADING = (0.03, 0.1, 0.3)
@@ -431,7 +431,7 @@ def _fading(speed: Tensor, time: Tensor) -> Tensor:
 
 
 def _over_time(problem: Problem) -> Tensor:
-    """Piecewise linear functions of the time in each run, `n x m x b x s`."""
+    """Smooth functions of the time in each run, `n x m x b x s`."""
     data = problem.data
     share = torch.zeros_like(data.time)
     for run in sorted(set(data.run.tolist())):
