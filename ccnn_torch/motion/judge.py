@@ -20,7 +20,7 @@ import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
 
-from ccnn_torch.evidence.form_error import DIRECTIONS, LEVELS, OF_SMOOTH, RARELY, share_of_exact
+from ccnn_torch.evidence.form_error import DIRECTIONS, LEVELS, LOG_EXACT, OF_SMOOTH, share_of_exact
 from ccnn_torch.evidence.judge import Explanation, judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams
 from ccnn_torch.motion.descent import free, sensitivities
@@ -157,7 +157,9 @@ def _judged(search: Search, axis: int, drivers: Sequence[Driver], above: float) 
     # What an effect makes of the logs has no form error where white noise is all that is left.
     every = named(0.0)
     # Each further name has to have its exact form as well.
-    exact = [(names, (), w + RARELY * max(len(names) - 2, 0), one) for names, drivers, w, one in every if not drivers]
+    exact = [
+        (names, (), w + LOG_EXACT / 2 * max(len(names) - 2, 0), one) for names, drivers, w, one in every if not drivers
+    ]
     beaten = max(w for *_, w, _ in every) - max(w for *_, w, _ in exact)
     share = share_of_exact(above, above, 1 + search.form[axis] / noise, problem.values, beaten)
     explanations = posterior([(share, exact), *(((1 - share) / len(LEVELS), named(level)) for level in LEVELS)])

@@ -43,7 +43,8 @@ def moved(
     cube: float = 0.0,
 ) -> Array:
     """Position of `INERTIA q'' = motor - (viscous - drive) q' - weight sin q - cube q^3 - teeth sin 84 q - dry
-    tanh(q' / 0.002)`, where the motor makes `GAIN (u - q + integral * integral of u - q + derivative * (u' - q')) - drive q'`
+    tanh(q' / 0.002)`, where the motor makes
+    `GAIN (u - q + integral * integral of u - q + derivative * (u' - q')) - drive q'`
     within its limit, and within the band takes u - q for 0."""
     fast = np.gradient(asked, time)
 
