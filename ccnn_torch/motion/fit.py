@@ -122,8 +122,7 @@ def _fits_of(
         those = torch.tensor([k for k, share in enumerate(once) if (share > _ONCE) == within], dtype=torch.int64)
         if len(those):
             some = Fits(*(value[those] for value in found))
-            unseen[those] = promised[those].square().sum(-1)
-            unseen[those] += squares_unseen(x[those], y[those], some, [groups[k] for k in those.tolist()], fold)
+            unseen[those] = promised[those].square().sum(-1) + squares_unseen(x[those], y[those], some, fold)
     return [
         Fit(
             spec,
@@ -163,21 +162,16 @@ def _in_one(does: Tensor, fold: Tensor) -> float:
     return float(squares.max() / squares.sum().clamp_min(1e-300)) if len(squares) > 1 else 0.0
 
 
-def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Sequence[Tensor]], fold: Tensor) -> Tensor:
+def squares_unseen(x: Tensor, y: Tensor, fit: Fits, fold: Tensor) -> Tensor:
     """Squares that linear models leave of runs that they were not fitted to, `p`; their scales are those of all runs.
 
     Args:
         x, y: whitened columns, `p x m x v`, and what they explain, `p x v`.
         fit: to all runs.
-        groups: of each model's columns.
         fold: of each value, `v`.
     """
-    ridge = torch.ones_like(x[..., 0])
-    # What acts in one fold alone leaves nothing for the others.
-    least = JITTER * x.square().sum(-1)
-    for k, own in enumerate(groups):
-        for g, columns in enumerate(own):
-            ridge[k, columns] = torch.exp(-fit.log_scale[k, g]) * fit.noise[k] + least[k, columns]
+    scale = fit.scale[:, : x.shape[1]]
+    ridge = torch.where(scale > 0, fit.noise[:, None] / scale.square(), 1.0)
     if int(fold.max()) == 0:
         return (y - (fit.mean[:, None, : x.shape[1]] @ x)[:, 0]).square().sum(-1)
     whole, along, found = x @ x.mT + torch.diag_embed(ridge), x @ y[..., None], torch.zeros_like(y[:, 0])

@@ -343,7 +343,7 @@ def holds(problem: Problem, candidate: Candidate, nuisance: int) -> bool:
     own, columns, y = candidate.rows
     fold = problem.fold[:, None].expand(problem.judged.shape).flatten()
     less, more = (
-        float(squares_unseen(x[None], y[None], weighed(candidate.grams, nuisance, [groups], None), [groups], fold))
+        float(squares_unseen(x[None], y[None], weighed(candidate.grams, nuisance, [groups], None), fold))
         for x, groups in ((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))
     )
     return more < less
