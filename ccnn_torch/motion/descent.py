@@ -100,14 +100,6 @@ class Point(NamedTuple):
     columns: Tensor
 
 
-def free(problem: Problem, theta: Tensor, axis: Tensor, places: Sequence[Sequence[int]]) -> Tensor:
-    """1 where a number is within the ends of what it may be, `p x m`, else 0: a linear model would take it beyond."""
-    at, real = padded(places)
-    low, high = (bound[axis].gather(-1, at) for bound in problem.library.bounds)
-    own = theta.gather(-1, at)
-    return real * (own > low) * (own < high)
-
-
 def renew(
     problem: Problem,
     whitening: Whitening,

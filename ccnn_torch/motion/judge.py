@@ -23,7 +23,7 @@ from torch import Tensor
 from ccnn_torch.evidence.form_error import DIRECTIONS, LEVELS, LOG_EXACT, OF_SMOOTH, share_of_exact
 from ccnn_torch.evidence.judge import Explanation, judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams
-from ccnn_torch.motion.descent import free, sensitivities
+from ccnn_torch.motion.descent import sensitivities
 from ccnn_torch.motion.fit import products, side_by_side, squares_unseen, weighed
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, prior_of
@@ -307,12 +307,13 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     )
     residual, columns = sensitivities(problem, found.whitening, theta, at, places)
     # Of the position itself, not of its whitened form.
+    low, high = (ends[axis] for ends in problem.library.bounds)
     # A number at an end of what it may be stays there.
-    columns = columns * free(problem, theta, at, places)[..., None]
+    free = ((theta > low) & (theta < high)).to(theta.dtype)
     left_plain, columns_plain = sensitivities(problem, plainly, theta, at, places)
     sets: list[tuple[int, Candidate]] = []
     for b, base in enumerate(bases):
-        own = columns[b, : len(places[b])]
+        own = columns[b, : len(places[b])] * free[b, list(places[b])][:, None]
         y = residual[b] + theta[b, list(places[b])] @ own
         prior = prior_of(base, drivers=1)
         for k, (driver, beside) in enumerate(zip(drivers, white, strict=True)):
@@ -325,7 +326,7 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     for n, (k, one) in enumerate(sets):
         b = n // len(drivers)
         m = len(places[b])
-        moved = means[n, :m] - theta[b, list(places[b])]
+        moved = (means[n, :m] - theta[b, list(places[b])]) * free[b, list(places[b])]
         rest = left_plain[b] - moved @ columns_plain[b, :m] - means[n, m : m + len(plain[k])] @ plain[k]
         taken[k][one.members] = float(rest.square().sum())
         gained = float(left_plain[b].square().sum()) - taken[k][one.members]
