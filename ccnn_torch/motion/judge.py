@@ -157,7 +157,7 @@ def _judged(search: Search, axis: int, drivers: Sequence[Driver], above: float) 
     # What an effect makes of the logs has no form error where white noise is all that is left.
     every = named(0.0)
     # Each further name has to have its exact form as well.
-    exact = [
+    exact: list[Named] = [
         (names, (), w + LOG_EXACT / 2 * max(len(names) - 2, 0), one) for names, drivers, w, one in every if not drivers
     ]
     beaten = max(w for *_, w, _ in every) - max(w for *_, w, _ in exact)
