@@ -53,7 +53,7 @@ def test_a_drift_of_the_encoder_is_outside_the_library(tmp_path: Path) -> None:
 
 
 def test_a_torque_with_the_cube_of_the_position_is_not_a_sum_of_names(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0, 2), 2.4, dry=0.02, cube=0.3)
+    log = write_log(tmp_path / "log.csv", (0,), 3.0, dry=0.02, cube=0.3)
     tried = ["joint_gain", "gravity", "servo_gain", "coulomb"]
     verdict = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), tried).content["verdict"]
     assert verdict["outside_library"] and verdict["driver"] == "position"
