@@ -24,8 +24,9 @@ LEVELS = (1.0, 0.25, 4.0)
 """Levels of the form error, equally probable: it is known to a factor of four or so."""
 # Standard deviations of the noise's mean square that a remainder must exceed in any case; and within which it is none.
 _CLEARLY, _SLIGHTLY = 5.0, 3.0
-# Log prior odds that all forms are those of the textbook, and directions in which a form error is sure to show.
-_LOG_EXACT = math.log(0.001)
+LOG_EXACT = math.log(0.001)
+"""Log prior odds that all forms are those of the textbook, of two effects or so."""
+# Directions in which a form error is sure to show.
 _SEEN = 6
 
 
@@ -81,7 +82,7 @@ def share_of_exact(left: float, other: float, usual: float, count: float, beaten
     """
     shown = math.log(usual) + other / usual - left
     misfit = max(left - 1 - _SLIGHTLY * math.sqrt(2 / count), 0.0) * count / 2
-    odds = _LOG_EXACT + _SEEN * shown / 2 - misfit - beaten
+    odds = LOG_EXACT + _SEEN * shown / 2 - misfit - beaten
     return 1 / (1 + math.exp(min(-odds, 700.0)))
 
 

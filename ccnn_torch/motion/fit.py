@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.dictionary import CERTAIN
 from ccnn_torch.evidence.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_variance
-from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, scaled
+from ccnn_torch.evidence.marginal_likelihood import JITTER, Fits, Grams, fit_sets, scaled
 from ccnn_torch.motion.descent import Point, descended, lots, padded, renew, sensitivities
 from ccnn_torch.motion.effects import EXACT
+from ccnn_torch.motion.known import VALUE
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.spec import Fit, Spec
 from ccnn_torch.motion.whiten import Whitening
@@ -89,6 +89,9 @@ def _fits_of(
 ) -> list[Fit]:
     """The evidence of models linearised at the `theta` of their sets.
 
+    What a linear model would take of the residual beyond that counts as left: the fit has tried that, and found a bound
+    there, or that the model is not linear so far.
+
     Args:
         specs: `p` sets.
         residual, columns, nuisance: whitened, `p x v`, `p x m x v` and `p x k x v`.
@@ -106,15 +109,20 @@ def _fits_of(
     ]
     # Runs of one stretch each have no parts.
     once = shares if int(folds[1].max()) > 0 else [0.0] * len(specs)
-    y = residual + (own[:, None] @ x)[:, 0]
+    inner = x @ x.mT
+    least = 1 - real + JITTER * inner.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).clamp_min(1.0)
+    more = torch.linalg.solve(inner + torch.diag_embed(least), x @ residual[..., None])
+    promised = (more.mT @ x)[:, 0]
+    y = residual - promised + (own[:, None] @ x)[:, 0]
     grams, beside = products(nuisance, x, y, values), nuisance.shape[1]
+    grams = grams._replace(yy=grams.yy + promised.square().sum(-1))
     found = weighed(grams, beside, groups, None)
     unseen = y.new_zeros(len(specs))
     for within, fold in enumerate(folds):
         those = torch.tensor([k for k, share in enumerate(once) if (share > _ONCE) == within], dtype=torch.int64)
         if len(those):
             some = Fits(*(value[those] for value in found))
-            unseen[those] = squares_unseen(x[those], y[those], some, [groups[k] for k in those.tolist()], fold)
+            unseen[those] = promised[those].square().sum(-1) + squares_unseen(x[those], y[those], some, fold)
     return [
         Fit(
             spec,
@@ -154,19 +162,16 @@ def _in_one(does: Tensor, fold: Tensor) -> float:
     return float(squares.max() / squares.sum().clamp_min(1e-300)) if len(squares) > 1 else 0.0
 
 
-def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Sequence[Tensor]], fold: Tensor) -> Tensor:
+def squares_unseen(x: Tensor, y: Tensor, fit: Fits, fold: Tensor) -> Tensor:
     """Squares that linear models leave of runs that they were not fitted to, `p`; their scales are those of all runs.
 
     Args:
         x, y: whitened columns, `p x m x v`, and what they explain, `p x v`.
         fit: to all runs.
-        groups: of each model's columns.
         fold: of each value, `v`.
     """
-    ridge = torch.ones_like(x[..., 0])
-    for k, own in enumerate(groups):
-        for g, columns in enumerate(own):
-            ridge[k, columns] = torch.exp(-fit.log_scale[k, g]) * fit.noise[k]
+    scale = fit.scale[:, : x.shape[1]]
+    ridge = torch.where(scale > 0, fit.noise[:, None] / scale.square(), 1.0)
     if int(fold.max()) == 0:
         return (y - (fit.mean[:, None, : x.shape[1]] @ x)[:, 0]).square().sum(-1)
     whole, along, found = x @ x.mT + torch.diag_embed(ridge), x @ y[..., None], torch.zeros_like(y[:, 0])
@@ -189,9 +194,8 @@ def form_errors(
         best: sets of each axis, none of which is clearly the best: the one whose forms are known best counts.
         least: the variance of each axis is at least that.
     """
-    # Of a model each of whose values was told how well it is known, that is all that it may be off by.
-    is_told = problem.unsure and problem.unsure.keys() <= problem.known.keys()
-    nominal = 0.0 if is_told else _OF_NOMINAL
+    # The form of a model is known the better, the better its least known value is.
+    nominal = _OF_NOMINAL * min(max(problem.unsure.values(), default=VALUE) / VALUE, 1.0) ** 2
     command, names = problem.data.command, problem.library.names
     does, most = (
         problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
@@ -226,16 +230,8 @@ def weighed(grams: Grams, beside: int, sets: Sequence[Sequence[Tensor]], varianc
     return fit_sets(own, sets, CERTAIN * own.values)
 
 
-class HasGrams(Protocol):
-    """What is weighed beside others."""
-
-    @property
-    def grams(self) -> Grams: ...
-
-
-def side_by_side(models: Sequence[HasGrams]) -> Grams:
+def side_by_side(each: Sequence[Grams]) -> Grams:
     """Inner products of `p` models as those of one batch, padded with 0 to the widest."""
-    each = [model.grams for model in models]
     widest = max(len(own.xy) for own in each)
 
     def wide(values: Tensor) -> Tensor:
@@ -246,23 +242,12 @@ def side_by_side(models: Sequence[HasGrams]) -> Grams:
 
 
 def deviations(fits: Sequence[Fit], beside: int, variances: Sequence[float]) -> list[Tensor]:
-    """Standard deviations of the numbers of sets, `m` in plausible sizes each, under noises that hold form errors too.
-
-    The values of the nominal model, `beside` columns, are taken for exact here.
-    """
-    if not fits:
-        return []
-    grams = side_by_side(fits)
-    noise = torch.tensor([max(v, fit.noise) for v, fit in zip(variances, fits, strict=True)], dtype=grams.yy.dtype)
-    own = Grams(
-        grams.xx[:, beside:, beside:] / noise[:, None, None],
-        grams.xy[:, beside:] / noise[:, None],
-        grams.yy / noise,
-        grams.values,
-    )
-    found = fit_sets(own, [fit.spec.groups for fit in fits], CERTAIN * own.values)
-    spread = found.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-    return [sd[: len(fit.spec.flat)] for sd, fit in zip(spread, fits, strict=True)]
+    """Standard deviations of the numbers of sets, `m` plausible sizes each, under noises that hold form errors too."""
+    each = [
+        weighed(fit.grams, beside, [fit.spec.groups], max(variance, fit.noise)).covariance[0]
+        for fit, variance in zip(fits, variances, strict=True)
+    ]
+    return [own.diagonal().clamp_min(0).sqrt() for own in each]
 
 
 def unseen_errors(found: Sequence[Sequence[Fit]]) -> list[float]:

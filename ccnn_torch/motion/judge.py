@@ -15,11 +15,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy.interpolate import BSpline
 from torch import Tensor
 
-from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH, share_of_exact
-from ccnn_torch.evidence.judge import judge, marginal, posterior
+from ccnn_torch.evidence.form_error import DIRECTIONS, LEVELS, LOG_EXACT, OF_SMOOTH, share_of_exact
+from ccnn_torch.evidence.judge import Explanation, judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams
 from ccnn_torch.motion.descent import sensitivities
 from ccnn_torch.motion.fit import products, side_by_side, squares_unseen, weighed
@@ -36,7 +38,7 @@ _UNCONFIRMED, _CLEARLY = 0.5, 3.0
 _BASES = 6
 # Share of what is left of runs that were not fitted up to which a set without a member is as good.
 _NEARLY = 1.02
-# Knots of a piecewise linear function: at quantiles of a driver, and evenly spaced ones of a position and of the time.
+# Knots of a cubic spline: at quantiles of a driver, and evenly spaced ones of a position and of the time.
 _KNOTS, _EVENLY = 7, 9
 # Time constants of what fades after a reversal [s].
 _FADING = (0.03, 0.1, 0.3)
@@ -135,17 +137,17 @@ def _above_white(problem: Problem, specs: Sequence[Spec]) -> list[float]:
     return ratio
 
 
-def _judged(found: Search, axis: int, drivers: Sequence[Driver], above: float) -> AxisVerdict:
-    problem, fits = found.problem, found.found[axis]
+def _judged(search: Search, axis: int, drivers: Sequence[Driver], above: float) -> AxisVerdict:
+    problem, fits = search.problem, search.found[axis]
     by_members = {f.members: f for f in fits}
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
     sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f)) for f in fits]
-    sets += with_drivers(found, axis, drivers, by_members)
-    twins, beside, noise = problem.library.twins, found.nuisance.shape[1], fits[0].noise
+    sets += with_drivers(search, axis, drivers, by_members)
+    twins, beside, noise = problem.library.twins, search.nuisance.shape[1], fits[0].noise
 
     def named(level: float) -> list[Named]:
-        weights = _weights(sets, beside, noise, level * found.form[axis], level * OF_SMOOTH)
+        weights = _weights(sets, beside, noise, level * search.form[axis], level * OF_SMOOTH)
         return [
             (names, one.drivers, w, one)
             for w, one in zip(weights, sets, strict=True)
@@ -154,24 +156,39 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver], above: float) -
 
     # What an effect makes of the logs has no form error where white noise is all that is left.
     every = named(0.0)
-    exact = [one for one in every if not one[1]]
+    # Each further name has to have its exact form as well.
+    exact: list[Named] = [
+        (names, (), w + LOG_EXACT / 2 * max(len(names) - 2, 0), one) for names, drivers, w, one in every if not drivers
+    ]
     beaten = max(w for *_, w, _ in every) - max(w for *_, w, _ in exact)
-    share = share_of_exact(above, above, 1 + found.form[axis] / noise, problem.values, beaten)
+    share = share_of_exact(above, above, 1 + search.form[axis] / noise, problem.values, beaten)
     explanations = posterior([(share, exact), *(((1 - share) / len(LEVELS), named(level)) for level in LEVELS)])
-    verdict = judge(explanations, explanations, of_classes=True)
+
+    def left_by(grams: Grams, groups: list[Tensor]) -> float:
+        """Squares that a set leaves, nominal values and time stamps being off as is likely."""
+        return noise * float(weighed(grams, beside, [groups], noise).rss)
+
+    def rest_of(one: Explanation[Candidate]) -> tuple[str, ...] | None:
+        """What the remainder of an explanation follows, where that is more than the noise and form errors."""
+        more = left_by(one.best.grams, one.best.groups) - noise * problem.values
+        if more <= max(noise * _CLEARLY**2 * math.sqrt(2 * problem.values), DIRECTIONS * search.form[axis]):
+            return None
+        return next((e.drivers for e in explanations if e.drivers and e.names == one.names), ())
+
+    verdict = judge(explanations, explanations, rest_of, of_classes=True)
     best, classes = least_unseen(by_members, verdict.chosen.best.members, verdict.classes)
     hidden, doubted = None, False
     probability = verdict.probability
-    if verdict.outside and not holds(problem, verdict.chosen.best, beside):
+    if verdict.outside and verdict.chosen.drivers and not holds(problem, verdict.chosen.best, beside):
         probability = min(probability, _UNCONFIRMED)
     most = _CLEARLY**2 * fits[0].rss
     if not best.members and not verdict.outside and best.rss > most:
         # Not what a value that is known no better explains as well.
         alone = (f for f in fits if len(f.members) == 1)
-        hidden = min(alone, key=lambda f: _after_nuisance(f, noise)).members[0]
-        doubted = _after_nuisance(best, noise) > most
+        hidden = min(alone, key=lambda f: left_by(f.grams, f.spec.groups)).members[0]
+        doubted = left_by(best.grams, []) > most
     marginals = {e: marginal(explanations, e) for e in {*(e for f in fits for e in f.members), *twins}}
-    driver = verdict.drivers[0] if verdict.outside else None
+    driver = next(iter(verdict.drivers), None) if verdict.outside else None
     return AxisVerdict(best, probability, marginals, classes, driver, hidden, doubted)
 
 
@@ -198,13 +215,6 @@ def least_unseen(
     return best, told
 
 
-def _after_nuisance(fit: Fit, noise: float) -> float:
-    """Squares that a set leaves, its numbers being plausible, and nominal values and time stamps off as is likely."""
-    xx, xy = fit.grams.xx, fit.grams.xy
-    inner = xx + noise * torch.eye(len(xx), dtype=xx.dtype)
-    return float(fit.grams.yy - xy @ torch.linalg.solve(inner, xy))
-
-
 def _weights(sets: Sequence[Candidate], nuisance: int, noise: float, form: float, smooth: float) -> list[float]:
     """Log posterior of each set under noise and form errors, not normalised; nuisance: how many columns it has.
 
@@ -212,9 +222,11 @@ def _weights(sets: Sequence[Candidate], nuisance: int, noise: float, form: float
     more than that share of what the driver does.
     """
 
+    grams = side_by_side([one.grams for one in sets])
+
     def under(variance: float) -> list[float]:
-        evidence = weighed(side_by_side(sets), nuisance, [one.groups for one in sets], variance).log_evidence.tolist()
-        return [found + one.log_prior for found, one in zip(evidence, sets, strict=True)]
+        found = weighed(grams, nuisance, [one.groups for one in sets], variance).log_evidence.tolist()
+        return [evidence + one.log_prior for evidence, one in zip(found, sets, strict=True)]
 
     weights = under(noise + form)
     best = sets[weights.index(max(weights))]
@@ -295,10 +307,13 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     )
     residual, columns = sensitivities(problem, found.whitening, theta, at, places)
     # Of the position itself, not of its whitened form.
+    low, high = (ends[axis] for ends in problem.library.bounds)
+    # A number at an end of what it may be stays there.
+    free = ((theta > low) & (theta < high)).to(theta.dtype)
     left_plain, columns_plain = sensitivities(problem, plainly, theta, at, places)
     sets: list[tuple[int, Candidate]] = []
     for b, base in enumerate(bases):
-        own = columns[b, : len(places[b])]
+        own = columns[b, : len(places[b])] * free[b, list(places[b])][:, None]
         y = residual[b] + theta[b, list(places[b])] @ own
         prior = prior_of(base, drivers=1)
         for k, (driver, beside) in enumerate(zip(drivers, white, strict=True)):
@@ -306,12 +321,12 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
             grams = products(found.nuisance[axis], x, y, values)
             groups = [*base.spec.groups, torch.arange(len(own), len(x))]
             sets.append((k, Candidate(base.members, (driver.name,), grams, groups, prior, (own, beside, y))))
-    each = [one for _, one in sets]
-    means = weighed(side_by_side(each), found.nuisance.shape[1], [one.groups for one in each], None).mean
+    grams = side_by_side([one.grams for _, one in sets])
+    means = weighed(grams, found.nuisance.shape[1], [one.groups for _, one in sets], None).mean
     for n, (k, one) in enumerate(sets):
         b = n // len(drivers)
         m = len(places[b])
-        moved = means[n, :m] - theta[b, list(places[b])]
+        moved = (means[n, :m] - theta[b, list(places[b])]) * free[b, list(places[b])]
         rest = left_plain[b] - moved @ columns_plain[b, :m] - means[n, m : m + len(plain[k])] @ plain[k]
         taken[k][one.members] = float(rest.square().sum())
         gained = float(left_plain[b].square().sum()) - taken[k][one.members]
@@ -329,7 +344,7 @@ def holds(problem: Problem, candidate: Candidate, nuisance: int) -> bool:
     own, columns, y = candidate.rows
     fold = problem.fold[:, None].expand(problem.judged.shape).flatten()
     less, more = (
-        float(squares_unseen(x[None], y[None], weighed(candidate.grams, nuisance, [groups], None), [groups], fold))
+        float(squares_unseen(x[None], y[None], weighed(candidate.grams, nuisance, [groups], None), fold))
         for x, groups in ((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))
     )
     return more < less
@@ -359,15 +374,15 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
     # An axis that follows exactly has no torque, and what rounding leaves of it has the sign of the speed.
     span = (data.position.amax((-1, -2)) - data.position.amin((-1, -2)))[:, None, None, None]
     loaded = error.abs().amax((-1, -2))[:, None, None, None] > _LOADED * span
-    place, over = _hats(moved, data.judged, True), _over_time(problem)
+    place, over = _smooth(moved, data.judged, True), _over_time(problem)
     sign = direction(speed, speed.abs().mean((-1, -2), keepdim=True))[:, None]
-    fast = _hats(speed, data.judged)
+    fast = _smooth(speed, data.judged)
     direct = {
         "speed": fast,
-        "acceleration": _hats(acceleration, data.judged),
+        "acceleration": _smooth(acceleration, data.judged),
         "reversal": _fading(speed, data.time),
         "position": place,
-        "torque": _hats(error, data.judged) * loaded,
+        "torque": _smooth(error, data.judged) * loaded,
         # A constant of its own: what drifts begins somewhere.
         "time": torch.cat([torch.ones_like(over[:, :1]), over], 1),
     }
@@ -390,19 +405,19 @@ def _slope(values: Tensor, step: Tensor) -> Tensor:
     return torch.cat([slope[..., :1], slope], -1)
 
 
-def _hats(driver: Tensor, judged: Tensor, is_even: bool = False) -> Tensor:
-    """Piecewise linear functions, `n x m x b x s`, with their knots at quantiles, or evenly spaced."""
+def _smooth(driver: Tensor, judged: Tensor, is_even: bool = False) -> Tensor:
+    """Cubic B-splines, `n x m x b x s`, with their knots at quantiles, or evenly spaced."""
     share = torch.linspace(*((0, 1, _EVENLY) if is_even else (*_ENDS, _KNOTS)), dtype=driver.dtype)
-    found = driver.new_zeros(len(driver), len(share), *driver.shape[1:])
-    for hats, one in zip(found, driver, strict=True):
+    found = driver.new_zeros(len(driver), len(share) + 2, *driver.shape[1:])
+    for splines, one in zip(found, driver, strict=True):
         some = one[judged]
         even = some.min() + share * (some.max() - some.min())
-        knots = torch.unique(even if is_even else torch.quantile(some, share))
+        knots = torch.unique(even if is_even else torch.quantile(some, share)).numpy()
         if len(knots) > 2:
-            place = (torch.searchsorted(knots, one.contiguous()) - 1).clamp(0, len(knots) - 2)
-            within = ((one - knots[place]) / (knots[place + 1] - knots[place])).clamp(0, 1)
-            hats.scatter_(0, place[None], (1 - within)[None])
-            hats.scatter_(0, place[None] + 1, within[None])
+            ends = np.concatenate([knots[:1].repeat(3), knots, knots[-1:].repeat(3)])
+            at = one.flatten().numpy().clip(knots[0], knots[-1])
+            values = BSpline.design_matrix(at, ends, 3).toarray()
+            splines[: values.shape[1]] = torch.from_numpy(values.T).reshape(-1, *one.shape)
     return found
 
 
@@ -419,11 +434,11 @@ def _fading(speed: Tensor, time: Tensor) -> Tensor:
 
 
 def _over_time(problem: Problem) -> Tensor:
-    """Piecewise linear functions of the time in each run, `n x m x b x s`."""
+    """Smooth functions of the time in each run, `n x m x b x s`."""
     data = problem.data
     share = torch.zeros_like(data.time)
     for run in sorted(set(data.run.tolist())):
         mine = data.run == run
         ends = data.time[mine][data.judged[mine]]
         share[mine] = ((data.time[mine] - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)).clamp(0, 1)
-    return _hats(share[None], data.judged, True).expand(len(problem.axes), -1, -1, -1)
+    return _smooth(share[None], data.judged, True).expand(len(problem.axes), -1, -1, -1)

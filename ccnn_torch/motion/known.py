@@ -12,13 +12,15 @@ TIME, _WEIGHT = "time", ("gravity_sin", "gravity_cos")
 _SAME = ("gain", "integral", "derivative", "inertia", "viscous", "coulomb", "load_friction", "stribeck", "delay")
 OF: dict[str, tuple[str, ...]] = {name: (name,) for name in _SAME} | {"mass": _WEIGHT, "torque_limit": ("weakness",)}
 """What of a model may be off, by its key, and the parameters of an axis that it is; of the load's mass its weight."""
-# Share to which a value is known (standard deviation), and share of a sampling step to which time stamps are.
-_VALUE, _STAMP = 0.03, 0.1
+VALUE = 0.03
+"""Share to which a value is known (standard deviation) unless that is told."""
+# The same of time stamps, as a share of a sampling step.
+_STAMP = 0.1
 
 
 def share_of(known: Mapping[str, float], key: str) -> float:
     """Share to which a value is known; of time stamps a share of the sampling step."""
-    return known.get(key, _STAMP if key == TIME else _VALUE)
+    return known.get(key, _STAMP if key == TIME else VALUE)
 
 
 def shares_of(exact: Sequence[str] = (), known: Mapping[str, float | str] | None = None) -> dict[str, float]:

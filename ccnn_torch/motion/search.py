@@ -157,7 +157,9 @@ class _Pool:
             fit for fit in fits if variance is not None and old.get((variance, fit.members), (0.0, None))[1] is not fit
         ]
         if variance is not None and new:
-            weighed_new = weighed(side_by_side(new), self.nuisance.shape[1], [f.spec.groups for f in new], variance)
+            weighed_new = weighed(
+                side_by_side([f.grams for f in new]), self.nuisance.shape[1], [f.spec.groups for f in new], variance
+            )
             for fit, evidence in zip(new, weighed_new.log_evidence.tolist(), strict=True):
                 old[variance, fit.members] = evidence + prior_of(fit), fit
         found = [(log_posterior(fit), fit) if variance is None else old[variance, fit.members] for fit in fits]

@@ -40,10 +40,12 @@ def moved(
     derivative: float = 0.0,
     teeth: float = 0.0,
     band: float = 0.0,
+    cube: float = 0.0,
 ) -> Array:
-    """Position of `INERTIA q'' = motor - (viscous - drive) q' - weight sin q - teeth sin 84 q - dry tanh(q' / 0.002)`,
-    where the motor makes `GAIN (u - q + integral * integral of u - q + derivative * (u' - q')) - drive q'` within its
-    limit, and within the band takes u - q for 0."""
+    """Position of `INERTIA q'' = motor - (viscous - drive) q' - weight sin q - cube q^3 - teeth sin 84 q - dry
+    tanh(q' / 0.002)`, where the motor makes
+    `GAIN (u - q + integral * integral of u - q + derivative * (u' - q')) - drive q'`
+    within its limit, and within the band takes u - q for 0."""
     fast = np.gradient(asked, time)
 
     def rate(t: float, state: Array) -> list[float]:
@@ -52,7 +54,7 @@ def moved(
         lead = derivative and derivative * (float(np.interp(t - delay, time, fast)) - v)
         error = u - q - min(max(u - q, -band), band)
         motor = min(max(GAIN * (error + integral * held + lead) - drive * v, -limit), limit)
-        torque = motor - (viscous - drive) * v - weight * math.sin(q) - dry * math.tanh(v / 0.002)
+        torque = motor - (viscous - drive) * v - weight * math.sin(q) - cube * q**3 - dry * math.tanh(v / 0.002)
         return [v, (torque - teeth * math.sin(84 * q)) / INERTIA, error]
 
     begin = [asked[0], 0.0, 0.0]

@@ -52,6 +52,13 @@ def test_a_drift_of_the_encoder_is_outside_the_library(tmp_path: Path) -> None:
     assert verdict["outside_library"] and verdict["driver"] == "time"
 
 
+def test_a_torque_with_the_cube_of_the_position_is_not_a_sum_of_names(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.csv", (0,), 3.0, dry=0.02, cube=0.3)
+    tried = ["joint_gain", "gravity", "servo_gain", "coulomb"]
+    verdict = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), tried).content["verdict"]
+    assert verdict["outside_library"] and verdict["driver"] == "position"
+
+
 def test_the_command_on_a_real_servo(tmp_path: Path, cli: Cli) -> None:
     logs = [w for name in ("sin_sin", "up_and_down") for w in ("--motion", DATA / f"servo_{name}.csv")]
     out = tmp_path / "out"

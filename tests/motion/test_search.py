@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ from motion.servo import KEYS, write_log
 
 from ccnn_torch.motion import load_logs, nominal_of
 from ccnn_torch.motion.effects import Facts, motion_effects
+from ccnn_torch.motion.fit import form_errors, weighed
 from ccnn_torch.motion.judge import least_unseen
 from ccnn_torch.motion.library import library_of
 from ccnn_torch.motion.search import _Pool, log_posterior, prior_of
@@ -36,6 +38,26 @@ def test_no_screen_leaves_an_effect_out_beside_one_other(tmp_path: Path) -> None
     fit = next(f for f in found.values() if f.settled and f.members)
     pool.fit([[fit.spec]], 3)
     assert found[fit.members] is fit
+
+
+def test_a_set_counts_by_what_its_simulation_leaves_and_a_form_by_what_is_known(tmp_path: Path) -> None:
+    # A push along the motion: friction below 0 would explain it, and there is none.
+    log = load_logs([write_log(tmp_path / "log.csv", (0, 2), 1.5, dry=-0.02)])
+    nominal, tried = nominal_of("servo", KEYS, ["rad"]), motion_effects(["coulomb"])
+    problem = problem_of(log, nominal, tried)
+    pool = _Pool(problem, white_noise(1))
+    pool.forward()
+    none, friction = pool.found[0][()], pool.found[0][0,]
+    assert friction.spec.theta.abs().max() == 0 and friction.rss == none.rss
+    linear = weighed(friction.grams, 0, [friction.spec.groups], None)
+    assert float(linear.rss) == pytest.approx(none.rss) and friction.unseen >= none.rss
+    # The better values are known the less the form of a model is wrong, without a jump.
+    found = []
+    for share in (0.0, 0.015, 0.0299, 0.03, 0.1):
+        known = replace(problem, known=dict.fromkeys(problem.unsure, share))
+        found += form_errors(known, pool.whitening, pool.nuisance, [[none]], [0.0])
+    assert found[0] == 0 and found == sorted(found) and found[2] == pytest.approx(found[3], rel=0.01)
+    assert found[3] == found[4] == form_errors(problem, pool.whitening, pool.nuisance, [[none]], [0.0])[0]
 
 
 def fit_of(count: int, evidence: float) -> Fit:
