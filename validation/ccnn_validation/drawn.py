@@ -18,7 +18,12 @@ Array = NDArray[np.float64]
 
 
 def commanded(
-    folder: Path, machine: str, records: tuple[str, Array], targets: tuple[str, Array], command: str = "run"
+    folder: Path,
+    machine: str,
+    records: tuple[str, Array],
+    targets: tuple[str, Array],
+    command: str = "run",
+    config: str = "mechanism: machine.yaml\n",
 ) -> Array | None:
     """Commands by the file that a calibration writes, `s x n` [SI]; None where there are none.
 
@@ -27,11 +32,12 @@ def commanded(
         machine: text of its file.
         records, targets: header and rows.
         command: `run` or `identify`.
+        config: lines of the config beside its records.
     """
     for name, (header, rows) in (("rows.csv", records), ("targets.csv", targets)):
         np.savetxt(folder / name, rows, "%.12g", ",", header=header, comments="")
     (folder / "machine.yaml").write_text(machine)
-    (folder / "config.yaml").write_text("records: rows.csv\nmechanism: machine.yaml\n")
+    (folder / "config.yaml").write_text(f"records: rows.csv\n{config}")
     contestant = Contestant(folder, command)
     contestant.call(command, "config.yaml", f"out={command}", "save_report=false")
     model = {"run": "model.safetensors", "identify": "identified.yaml"}[command]
