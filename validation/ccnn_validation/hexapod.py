@@ -1,10 +1,10 @@
 """A hexapod whose legs are rolled screws that grow with two temperatures, judged on the true machine on another day.
 
-`python -m ccnn_validation.hexapod --seed N [--machines N] [--rows N]`. A tracker finds three reflectors on the platform,
-and so its pose; beside it stand the temperatures of the hall and of the nut of leg 1. The true machine has joints
-beside their places (150 µm), universal joints whose axes do not meet (20 µm), legs that are too long (300 µm), screws of
-grade T7 (ISO 3408-3: 52 µm over 300 mm) with a wobble at each turn of 5 mm, and warm screws, each its own share of what
-the nut shows. Ours (`ccnn run` and `ccnn identify`, by the written files) stands beside a SciPy fit of all that but the
+`python -m ccnn_validation.hexapod --seed N [--machines N] [--rows N]`. A tracker finds three reflectors on the
+platform, and so its pose; beside it stand the temperatures of the hall and of the nut of leg 1. The true machine has
+joints beside their places (150 µm), universal joints whose axes do not meet (20 µm), legs that are too long (300 µm),
+screws of grade T7 (ISO 3408-3: 52 µm over 300 mm) with a wobble at each turn of 5 mm, and warm screws, each its own
+share of what the nut shows. Ours (`ccnn run` and `ccnn identify`, by the written files) stands beside a SciPy fit of all that but the
 axes that do not meet, alone and with scikit-learn's Gaussian process on what it leaves. Judged are the three reflectors
 at poses not measured, in the frames of base and platform that suit what is reached best.
 """
@@ -48,7 +48,7 @@ _TURNS = np.radians([0, 120, 120, 240, 240, 360])
 _SIDES = SPREAD * np.array([1, -1, 1, -1, 1, -1])
 BASE = ring(BASE_RADIUS, _TURNS + _SIDES)
 PLATFORM = ring(PLATFORM_RADIUS, np.radians([60, 60, 180, 180, 300, 300]) - _SIDES)
-MIDDLE = float(np.linalg.norm(PLATFORM + [0, 0, HEIGHT] - BASE, axis=1).mean())
+MIDDLE = float(np.linalg.norm(PLATFORM - BASE + np.array([0, 0, HEIGHT]), axis=1).mean())
 
 
 def between(pose: Pose, base: Array, platform: Array) -> Array:
@@ -155,7 +155,7 @@ def drawn_poses(rows: int, rng: np.random.Generator, part: float = 1.0) -> Pose:
 
 
 def missed(wanted: Array, reached: Array) -> float:
-    """Root mean square of a reflector's miss [m], in the best frame of the base and with the best place on the platform.
+    """Root mean square of a reflector's miss [m], in the best frame of the base and with the best nests.
 
     Args:
         wanted, reached: reflectors, `s x 3 x 3`.
