@@ -4,9 +4,10 @@
 platform, and so its pose; beside it stand the temperatures of the hall and of the nut of leg 1. The true machine has
 joints beside their places (150 µm), universal joints whose axes do not meet (20 µm), legs that are too long (300 µm),
 screws of grade T7 (ISO 3408-3: 52 µm over 300 mm) with a wobble at each turn of 5 mm, and warm screws, each its own
-share of what the nut shows. Ours (`ccnn run` and `ccnn identify`, by the written files) stands beside a SciPy fit of all that but the
-axes that do not meet, alone and with scikit-learn's Gaussian process on what it leaves. Judged are the three reflectors
-at poses not measured, in the frames of base and platform that suit what is reached best.
+share of what the nut shows. Ours (`ccnn run` and `ccnn identify` with the machine file of a hexapod, `ccnn run` with
+the mechanism `stewart`, each by the written file) stands beside a SciPy fit of all that but the axes that do not meet,
+alone and with scikit-learn's Gaussian process on what it leaves. Judged are the three reflectors at poses not measured,
+in the frames of base and platform that suit what is reached best.
 """
 
 from __future__ import annotations
@@ -37,7 +38,14 @@ MACHINE = """machine: hexapod
 numbers: {base_radius: 280 mm, platform_radius: 160 mm, base_spread: 12 deg, platform_spread: 12 deg, height: 420 mm,
   L: 0 mm +- 0.3 mm}
 """
-CONFIG = "mechanism: framed\nmechanism_keys: {mechanism: machine.yaml, base: true, tool: true}\n"
+CONFIG = "mechanism: framed\nmechanism_keys: {base: true, tool: true, mechanism: "
+DRAWING = "{base_radius: 0.28, platform_radius: 0.16, base_spread: 0.2094395, platform_spread: 0.2094395, height: 0.42}"
+# Called, and named, by the command that is used and the machine as its file has it.
+WAYS = {
+    "ours, run": ("run", f"{CONFIG}machine.yaml}}\n"),
+    "ours, identify": ("identify", f"{CONFIG}machine.yaml}}\n"),
+    "ours, run of stewart": ("run", f"{CONFIG}stewart, keys: {DRAWING}}}\n"),
+}
 
 
 def ring(radius: float, angles: Array) -> Array:
@@ -262,10 +270,11 @@ def judged(seed: int, rows: int) -> dict[str, float]:
     sent["script and process"] = script_commands(numbers, wanted, then, more)
     found = {}
     with TemporaryDirectory() as folder:
-        for way in ("run", "identify"):
-            files = table(command, warmth, pose), table(legs(wanted), then)
-            commands = commanded(Path(folder), MACHINE, *files, way, config=CONFIG)
-            sent[f"ours, {way}"] = np.full_like(command[:1], np.nan) if commands is None else commands
+        files = table(command, warmth, pose), table(legs(wanted), then)
+        for name, (way, config) in WAYS.items():
+            (Path(folder) / name).mkdir()
+            commands = commanded(Path(folder) / name, MACHINE, *files, way, config)
+            sent[name] = np.full_like(command[:1], np.nan) if commands is None else commands
     for who, legs_sent in sent.items():
         lost = np.isnan(legs_sent).any()
         found[who] = np.nan if lost else missed(goal, spots(machine.reached(legs_sent, then, wanted), machine.nests))
