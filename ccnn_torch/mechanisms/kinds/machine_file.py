@@ -80,6 +80,12 @@ def build_machine(content: Mapping[str, Any], where: str, makers: Mapping[str, C
     _check_names([str(name)], list(KINDS), f"{where}: machine:")
     about = _kind(name)
     known = ["machine", "numbers", *(_OF_ARMS if "chain" in about else [])]
+    frame = next((key for key in ("base_frame", "tool_frame") if key in content and key not in known), None)
+    if frame is not None:
+        raise InputError(
+            f"{where}: {frame} of a parallel machine is no key of its file; to have frames fitted write "
+            "mechanism: framed and mechanism_keys: {mechanism: FILE, base: true, tool: true} into the config"
+        )
     _check_names([str(key) for key in content], known, f"{where}: the key")
     given = content.get("numbers") or {}
     if not isinstance(given, Mapping):
