@@ -307,9 +307,12 @@ class Functions:
             bounded = own.machine.within(q, wanted, own.most)
             found, doubt = bounded, self._doubt(wanted, correction, aim)
         if own.effects is not None:
-            found = own.limited(found + weight * own.effects(caged[..., :n] + found, caged[..., n:]))
+            found = found + weight * own.effects(caged[..., :n] + found, caged[..., n:])
         if own.geometry is not None:
-            found = own.limited(found + weight * own.geometry(caged[..., :n] + found))
+            found = found + weight * own.geometry(caged[..., :n] + found)
+        if own.effects is not None or own.geometry is not None:
+            # The limit is that of the sum: either part may be larger than what both leave.
+            found = own.limited(found)
         return {"found": found, "excess": excess, "weight": weight, "features": features, "doubt": doubt}
 
     def following(self, found: Tensor, correction: Tensor, steps: Tensor) -> Variables:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from machines import arm, overconstrained, small_network
 from module_graph import to_onnx
-from torch import Tensor
+from torch import Tensor, nn
 
 from ccnn_torch.compensation import (
     expand,
@@ -84,6 +84,23 @@ def test_a_machine_without_closed_forms_is_expanded(tmp_path: Path) -> None:
     assert "geometry" in json.loads((tmp_path / "card.json").read_text())
     found = load_model(path)(joints.numpy())
     torch.testing.assert_close(torch.from_numpy(found["command"]), made(joints)[0], rtol=0, atol=1e-15)
+
+
+class Opposite(nn.Module):
+    """An effect that takes back what the geometry does, as growth does of lengths that are off."""
+
+    def forward(self, joints: Tensor, covariates: Tensor) -> Tensor:
+        return torch.full_like(joints, -0.1)
+
+
+def test_geometry_and_effects_may_each_be_larger_than_what_both_leave() -> None:
+    known = overconstrained()
+    network, scaling, deviations = small_network(known.joints, 2e-5)
+    geometry = expand(lambda joints: torch.full_like(joints, 0.1), known.joints)
+    about = network, scaling, known.joints, deviations, known.mechanism.joints
+    made = fit_compensator(*about, geometry=geometry, effects=Opposite())  # type: ignore[arg-type]
+    assert float(made.limit.max()) < 1e-3
+    torch.testing.assert_close(made.deviation(known.joints), deviations, rtol=0, atol=1e-10)
 
 
 def test_an_expansion_says_when_it_does_not_fit() -> None:
