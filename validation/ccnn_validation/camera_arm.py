@@ -150,7 +150,7 @@ def by_script(joints: Array, direction: Array, payload: Array, place: Array, tur
         size = np.linalg.norm(rows, axis=1, keepdims=True)
         # Huber's loss of a row, as a residual.
         rows = rows * np.sqrt(np.where(size < 4, 1, (8 * size - 16) / np.maximum(size, 1e-9) ** 2))
-        return np.r_[rows.ravel(), u[:56], 0.01 * u[56:]]
+        return np.asarray(np.r_[rows.ravel(), u[:56], 0.01 * u[56:]])
 
     found = least_squares(left, np.zeros(68)).x
     return found[:56] * PRIOR, off(found)[0]

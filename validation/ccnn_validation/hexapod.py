@@ -232,7 +232,7 @@ def script_commands(x: Array, pose: Pose, warmth: Array, more: Array | float = 0
 
 
 def inputs(command: Array, warmth: Array) -> Array:
-    return np.c_[(command - MIDDLE) / 0.04, (warmth - 24) / 4]
+    return np.asarray(np.c_[(command - MIDDLE) / 0.04, (warmth - 24) / 4])
 
 
 def process(command: Array, warmth: Array, left: Array) -> list[GaussianProcessRegressor]:
