@@ -180,6 +180,10 @@ def _parallel(
     keys = {}
     for key, entry in about.get("keys", {}).items():
         (number,) = _numbers(key, entry, given, _unit_of(entry), 1, where)
+        if number.tolerance:
+            raise InputError(
+                f"{where}: numbers.{key}: takes no tolerance, since it is not fitted; write its value alone"
+            )
         keys[key] = number.value
     mechanism = makers[about["mechanism"]](**keys)
     places = {p.name: i for i, p in enumerate(mechanism.geometry)}
