@@ -22,8 +22,8 @@ from ccnn_torch.report.results.base import Spread, interval_text, removed_percen
 from ccnn_torch.report.results.run import Before, Method, MethodPose, ModelFiles, Mse, RmsMax, RunResults
 from ccnn_torch.report.table import Table, table_of
 
-# By less a learned part may be worse on other rows by chance.
-_WORSE = 1.01
+# By less a learned part may be worse on other rows by chance: 100 rows tell an RMS error to 4 %, one to sqrt(1 / 600).
+_WORSE = 1.05
 
 
 @cache

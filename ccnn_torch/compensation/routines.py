@@ -298,6 +298,15 @@ class Functions:
         value = self.faded(raw, weight)
         return Learned(value, excess, weight, features, caged)
 
+    def known(self, weight: Tensor, caged: Tensor) -> Tensor:
+        """Weight of geometry and effects, `... x 1`: other temperatures and loads than measured do not end it."""
+        own, n = self.own, self.joints
+        if not own.covariates:
+            return weight
+        usual = own.domain.centre[n:].expand_as(caged[..., n:])
+        fade = torch.relu(1 - self.excess(torch.cat([caged[..., :n], usual], -1)))
+        return torch.maximum(weight, fade * fade)
+
     def step(self, q: Tensor, x: Tensor, correction: Tensor, aim: Tensor) -> Variables:
         own, n = self.own, self.joints
         found, excess, weight, features, caged = self.learned(q - correction, x)
@@ -306,10 +315,16 @@ class Functions:
             wanted = own.machine.next_correction(q - correction + found, own.held(x), q, correction, aim)
             bounded = own.machine.within(q, wanted, own.most)
             found, doubt = bounded, self._doubt(wanted, correction, aim)
-        if own.effects is not None:
-            found = own.limited(found + weight * own.effects(caged[..., :n] + found, caged[..., n:]))
-        if own.geometry is not None:
-            found = own.limited(found + weight * own.geometry(caged[..., :n] + found))
+        if own.effects is not None or own.geometry is not None:
+            known = self.known(weight, caged)
+            # The safe correction is of the whole deviation.
+            found = found + (weight - known) * own.safe
+            if own.effects is not None:
+                found = found + known * own.effects(caged[..., :n] + found, own.held(caged[..., n:]))
+            if own.geometry is not None:
+                found = found + known * own.geometry(caged[..., :n] + found)
+            # The limit is that of the sum: either part may be larger than what both leave.
+            found = own.limited(found)
         return {"found": found, "excess": excess, "weight": weight, "features": features, "doubt": doubt}
 
     def following(self, found: Tensor, correction: Tensor, steps: Tensor) -> Variables:

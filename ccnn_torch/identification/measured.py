@@ -255,7 +255,8 @@ def _check_joints(records: Records, mechanism: Mechanism) -> None:
     if len(lost):
         raise InputError(
             f"{records.path}: {mechanism.name} has no pose for the joints at {records.name_rows(lost)}; correct or "
-            f"remove {'it' if len(lost) == 1 else 'them'}, or check the units and the order of the joints"
+            f"remove {'it' if len(lost) == 1 else 'them'}, or check the units and the order of the joints; "
+            "poses in the frame of a measuring device need mechanism: framed (docs/how_to/mechanisms.md)"
         )
 
 

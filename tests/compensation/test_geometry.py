@@ -9,7 +9,7 @@ import pytest
 import torch
 from machines import arm, overconstrained, small_network
 from module_graph import to_onnx
-from torch import Tensor
+from torch import Tensor, nn
 
 from ccnn_torch.compensation import (
     expand,
@@ -20,6 +20,7 @@ from ccnn_torch.compensation import (
 )
 from ccnn_torch.compensation.expansions import ChebyshevExpansion
 from ccnn_torch.compensation.model_files.metadata import check_graph, open_onnx
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.mechanisms import Mechanism
 
@@ -84,6 +85,28 @@ def test_a_machine_without_closed_forms_is_expanded(tmp_path: Path) -> None:
     assert "geometry" in json.loads((tmp_path / "card.json").read_text())
     found = load_model(path)(joints.numpy())
     torch.testing.assert_close(torch.from_numpy(found["command"]), made(joints)[0], rtol=0, atol=1e-15)
+
+
+class Opposite(nn.Module):
+    """An effect that takes back what the geometry does, as growth does of lengths that are off."""
+
+    def forward(self, joints: Tensor, covariates: Tensor) -> Tensor:
+        return torch.full_like(joints, -0.01)
+
+
+def test_geometry_and_effects_may_each_be_larger_than_what_both_leave_and_hold_when_it_is_warmer() -> None:
+    known = overconstrained()
+    warmth = torch.linspace(293.0, 295.0, len(known.joints), dtype=torch.float64)[:, None]
+    inputs = torch.cat([known.joints, warmth], -1)
+    network, scaling, deviations = small_network(inputs, 2e-5, known.joints.shape[-1])
+    geometry = expand(lambda joints: 0.01 + 1e-4 * joints, known.joints)
+    about = network, scaling, inputs, deviations, known.mechanism.joints, [Coordinate("temperature", "K")]
+    made = fit_compensator(*about, geometry=geometry, effects=Opposite())  # type: ignore[arg-type]
+    assert float(made.limit.max()) < 1e-3
+    both = 1e-4 * (known.joints + deviations - 0.01)
+    torch.testing.assert_close(made.deviation(known.joints, warmth), deviations + both, rtol=0, atol=1e-10)
+    warmer = made.deviation(known.joints, warmth + 20)
+    torch.testing.assert_close(warmer, 1e-4 * (known.joints - 0.01), rtol=0, atol=1e-10)
 
 
 def test_an_expansion_says_when_it_does_not_fit() -> None:

@@ -75,7 +75,7 @@ def _from_a_tracker(pose: Tensor) -> Tensor:
         (
             "delta",
             _poses(_from_a_tracker),
-            "seen from a frame .*=framed 'mechanism_keys={mechanism: delta}'",
+            'seen from a frame .*=framed \'mechanism_keys={"mechanism": "delta"}\'',
         ),
     ],
 )

@@ -163,6 +163,8 @@ def test_a_delta_printer_has_a_value_for_each_tower(tmp_path: Path) -> None:
         ("machine: gantry\nlimits: 3", "limits: must be as"),
         ("machine: gantry\nnumbers: 3", "must have lines such as"),
         ("machine: gantry\ntool_fram: identity", "the key 'tool_fram' is not known; did you mean 'tool_frame'"),
+        ("machine: hexapod\nnumbers: {base_radius: 280 mm +- 1 mm}", "takes no tolerance, since it is not fitted"),
+        ("machine: hexapod\nbase_frame: unknown", "base_frame of a parallel machine is no key of its file; to have"),
         ("machine: gantry\nbase_frame: [1, 2]", "base_frame: must be unknown, identity or"),
         ("machine: gantry\nlimits: {q1: [1 mm, 0 mm]}", "limits.q1: must be"),
         ("machine: gantry\nlimits: {q9: [0 mm, 1 mm]}", "limits: 'q9' is not known"),

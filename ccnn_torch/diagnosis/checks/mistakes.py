@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -331,7 +332,10 @@ def frame_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
         except InputError:
             return ""
         there = framed.frame(framed.forward_kinematics(joints, framed.fitted_frames(joints, seen)))[0]
-        key = f"mechanism=framed 'mechanism_keys={{mechanism: {_inside(mechanism.recipe)}}}'"
+        inside = {"mechanism": mechanism.recipe.get("spec", ""), "keys": mechanism.recipe.get("keys", {})}
+        # As JSON, whose quotes a shell takes within its own.
+        told = json.dumps({key: value for key, value in inside.items() if value}, ensure_ascii=False)
+        key = f"mechanism=framed 'mechanism_keys={told}'"
         missing = [c.name for c in framed.pose if c.name not in {own.name for own in mechanism.pose}]
         key += f", and give the pose as {', '.join(c.name for c in framed.pose)}" if missing else ""
     left = torch.linalg.vector_norm(there - seen[0], dim=-1).nan_to_num(nan=torch.inf) / size.place
@@ -381,11 +385,6 @@ def _closed_form(arm: SerialArm, joints: Tensor, measured: Tensor) -> Tensor:
     weights = torch.ones(len(joints), dtype=joints.dtype)
     frames = best_closed_form(*arm.flange(joints), arm.frame(measured), arm.nominal[-6:], weights, ROTATION_WEIGHT)
     return torch.cat([frames[:6], arm.nominal[6:-6], frames[6:]])
-
-
-def _inside(recipe: dict[str, Any]) -> str:
-    keys = ", ".join(f"{name}: {value}" for name, value in recipe.get("keys", {}).items())
-    return str(recipe.get("spec", "")) + (f", keys: {{{keys}}}" if keys else "")
 
 
 # Sizes of the machine: a row farther off is of other joints.

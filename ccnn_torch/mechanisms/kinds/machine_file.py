@@ -80,6 +80,12 @@ def build_machine(content: Mapping[str, Any], where: str, makers: Mapping[str, C
     _check_names([str(name)], list(KINDS), f"{where}: machine:")
     about = _kind(name)
     known = ["machine", "numbers", *(_OF_ARMS if "chain" in about else [])]
+    frame = next((key for key in ("base_frame", "tool_frame") if key in content and key not in known), None)
+    if frame is not None:
+        raise InputError(
+            f"{where}: {frame} of a parallel machine is no key of its file; to have frames fitted write "
+            "mechanism: framed and mechanism_keys: {mechanism: FILE, base: true, tool: true} into the config"
+        )
     _check_names([str(key) for key in content], known, f"{where}: the key")
     given = content.get("numbers") or {}
     if not isinstance(given, Mapping):
@@ -174,6 +180,10 @@ def _parallel(
     keys = {}
     for key, entry in about.get("keys", {}).items():
         (number,) = _numbers(key, entry, given, _unit_of(entry), 1, where)
+        if number.tolerance:
+            raise InputError(
+                f"{where}: numbers.{key}: takes no tolerance, since it is not fitted; write its value alone"
+            )
         keys[key] = number.value
     mechanism = makers[about["mechanism"]](**keys)
     places = {p.name: i for i, p in enumerate(mechanism.geometry)}
