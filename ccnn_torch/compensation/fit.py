@@ -14,13 +14,13 @@ from ccnn_torch.compensation.compensator import TOLERANCE, Compensator, default_
 from ccnn_torch.compensation.domain import POINTS, Domain, spread_points
 from ccnn_torch.compensation.effects import Care, PhysicalEffects, expand_effects, gains
 from ccnn_torch.compensation.expansions import ChebyshevExpansion, expand
-from ccnn_torch.compensation.machine import ASTRAY, FARTHEST, Machine, build_machine
+from ccnn_torch.compensation.machine import ASTRAY, FARTHEST, Machine, build_machine, closed_form_of
 from ccnn_torch.compensation.routines import Functions, Variables, next_step, routines_of
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.effects import Acting, Situation, default_gravity
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners.constant import ConstantNetwork
-from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.training import Scaling
 
@@ -352,7 +352,7 @@ def machine_parts(
         InputError, MethodFailedError: what effects see of the machine, or its geometry, is no polynomial of the joints.
     """
     mechanism = rows.mechanism
-    closed = isinstance(mechanism, SerialArm) or mechanism.closed_form is not None
+    closed = closed_form_of(mechanism) is not None
     effects = expand_effects(rows, acting, covariates, margin, None if closed else _care(rows)) if acting else None
     machine = build_machine(mechanism, values, effects, rows.joints, margin)
     if machine is not None:

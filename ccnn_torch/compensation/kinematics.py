@@ -191,6 +191,12 @@ class ClosedKinematics(nn.Module):
                 return steps
         return most
 
+    def frame(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Position `... x 3` [m] and rotation `... x 3 x 3` of a machine that turns, at pose coordinates `... x p`."""
+        position, rotation = self._mechanism[0].frame(pose)
+        assert rotation is not None
+        return position, rotation
+
     def coordinates(self, pose: Tensor, shift: Tensor) -> Tensor:
         """Pose coordinates `s x p` of a small shift of the frame at a pose, `s x c` [m, rad]."""
         seen = frame_slope(self._mechanism[0].frame, pose)

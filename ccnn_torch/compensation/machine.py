@@ -18,7 +18,9 @@ from ccnn_torch.compensation.kinematics import (
     inverse,
     skew_vector,
 )
-from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, mechanism_from_description
+from ccnn_torch.mechanisms.machines.links import compose
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 # Keeps what is inverted regular in the middle of a singular pose: of what shows how near it is, and of a step [m²].
 _NEAR, _REGULAR = 1e-10, 1e-12
@@ -236,8 +238,77 @@ def limits_of(mechanism: Mechanism) -> tuple[Tensor, Tensor]:
     return torch.where(free, -none, mechanism.limits[:, 0]), torch.where(free, none, mechanism.limits[:, 1])
 
 
+def _inner(mechanism: Mechanism) -> Mechanism:
+    """The machine itself, without the frames that it is seen through."""
+    return mechanism.mechanism if isinstance(mechanism, Framed) else mechanism
+
+
+class Frames(nn.Module):
+    """What lies between the poses of a nominal and an identified machine whose frames differ a little.
+
+    Both machines are seen through base and tool frames B F(q) T. A pose that is wanted of the identified one is
+    F' = (B⁻¹ B')⁻¹ F (T' T⁻¹)⁻¹ of the machine inside.
+
+    Attributes:
+        inside: pose, frame and derivatives of the machine inside.
+    """
+
+    # Of Newton's method, from a pose that is off by what was identified.
+    _STEPS = 3
+
+    def __init__(self, mechanism: Framed, identified: Tensor, inside: ClosedKinematics) -> None:
+        super().__init__()
+        (base, _, tool), (real_base, _, real_tool) = mechanism.split(mechanism.nominal), mechanism.split(identified)
+        before, after = _transform(real_base), _transform(real_tool)
+        # Products of two rotations, row by row: rotation and shift.
+        self._out = compose(_backward(_transform(base)), before), compose(after, _backward(_transform(tool)))
+        self._in = _backward(self._out[0]), _backward(self._out[1])
+        self._turn, self._lever = before[0], after[1]
+        # In a tuple, since the polynomial is stored once.
+        self._inside = (inside,)
+
+    def into(self, pose: Tensor) -> Tensor:
+        """Pose coordinates `... x p` of the identified machine inside, where the nominal one would have these."""
+        return self._moved(pose, self._in)
+
+    def out_of(self, pose: Tensor) -> Tensor:
+        """The other way."""
+        return self._moved(pose, self._out)
+
+    def shift(self, pose: Tensor, seen: Tensor) -> Tensor:
+        """A small shift of the frame that is seen, `... x 6` [m, rad], as one of the machine inside, at its pose."""
+        turn, moved = (seen[..., k : k + 3] @ self._turn for k in (3, 0))
+        _, rotation = self._inside[0].frame(pose)
+        lever = (rotation @ self._lever.unsqueeze(-1)).squeeze(-1)
+        return torch.cat([moved - torch.linalg.cross(turn, lever, dim=-1), turn], -1)
+
+    def _moved(self, pose: Tensor, by: tuple[_Transform, _Transform]) -> Tensor:
+        inside, rows = self._inside[0], pose.reshape(-1, pose.shape[-1])
+        position, rotation = inside.frame(rows)
+        rotation, position = compose(compose(by[0], (rotation, position)), by[1])
+        for _ in range(self._STEPS):
+            place, turn = inside.frame(rows)
+            gap = torch.cat([position - place, skew_vector(rotation @ turn.mT)], -1)
+            rows = rows + inside.coordinates(rows, gap)
+        return rows.reshape(pose.shape)
+
+
+_Transform = tuple[Tensor, Tensor]
+
+
+def _transform(frame: Tensor) -> _Transform:
+    """Rotation and position of a frame of six numbers."""
+    return rotation_vector_to_matrix(frame[3:]), frame[:3]
+
+
+def _backward(by: _Transform) -> _Transform:
+    return by[0].mT, -(by[0].mT @ by[1])
+
+
 class InverseMachine(Machine):
     """g(P⁻¹(X, c); θ) - e_joints: every step finds the joints that the identified machine has at the pose.
+
+    Poses X are those of the machine inside, where it is seen through frames.
 
     Attributes:
         start: polynomial from which Newton's method finds the nominal pose of ideal joints.
@@ -258,20 +329,25 @@ class InverseMachine(Machine):
         assert start is not None
         super().__init__(mechanism, identified, effects, rule)
         self.start = start
+        nominal, real = _inner(mechanism), _inner(self.real)
         # In a tuple, since the polynomial is stored once.
-        self._closed = (ClosedKinematics(mechanism, start), ClosedKinematics(self.real, start))
+        self._closed = (ClosedKinematics(nominal, start), ClosedKinematics(real, start))
+        self._frames = Frames(mechanism, identified, self._closed[0]) if isinstance(mechanism, Framed) else None
+        self._solve, self._numbers = nominal.solve_inverse, (nominal.nominal, real.nominal)
         self.newton = newton
 
     def aim(self, joints: Tensor) -> Tensor:
         """Pose coordinates `... x p` [SI], and 1 where the machine cannot take the pose."""
         pose, there = self._closed[0].standing(joints, self.newton)
-        return self._flat_pose(pose, there, self.identified)
+        pose = pose if self._frames is None else self._frames.into(pose)
+        return self._flat_pose(pose, there, self._numbers[1])
 
     def aim_back(self, moved: Tensor, covariates: Tensor) -> Tensor:
         joints, shift = (None, None) if self.effects is None else self.effects.changes(moved, covariates)
         pose, there = self._closed[1].standing(moved if joints is None else moved + joints, self.newton)
         pose = pose if shift is None else pose + self._coordinates(pose, shift)
-        return self._flat_pose(pose, there, self.mechanism.nominal)
+        pose = pose if self._frames is None else self._frames.out_of(pose)
+        return self._flat_pose(pose, there, self._numbers[0])
 
     def next_correction(
         self, moved: Tensor, covariates: Tensor, ideal: Tensor, correction: Tensor, aim: Tensor
@@ -279,14 +355,14 @@ class InverseMachine(Machine):
         joints, shift = (None, None) if self.effects is None else self.effects.changes(moved, covariates)
         pose = aim[..., :-1]
         pose = pose if shift is None else pose - self._coordinates(pose, shift)
-        wanted = self.mechanism.solve_inverse(pose, self.identified)
+        wanted = self._solve(pose, self._numbers[1])
         # Command and what is added to it are the joints of the real machine.
         added = moved - (ideal - correction)
         found = ideal - wanted + (added if joints is None else added + joints)
         return _where_there(found, aim)
 
     def next_back(self, joints: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
-        found = joints + correction - self.mechanism.solve_inverse(aim[..., :-1])
+        found = joints + correction - self._solve(aim[..., :-1], self._numbers[0])
         return _where_there(found, aim)
 
     def describe(self) -> dict[str, Any]:
@@ -295,7 +371,7 @@ class InverseMachine(Machine):
     @classmethod
     def _blank(cls, mechanism: Mechanism, description: dict[str, Any]) -> dict[str, Any]:
         unit = torch.ones(len(mechanism.joints), dtype=torch.float64)
-        polynomial = ChebyshevExpansion(unit, unit.clone(), description["degree"], outputs=len(mechanism.pose))
+        polynomial = ChebyshevExpansion(unit, unit.clone(), description["degree"], outputs=len(_inner(mechanism).pose))
         return {"start": polynomial, "newton": description["newton"]}
 
     def _prepare(self) -> None:
@@ -303,13 +379,15 @@ class InverseMachine(Machine):
 
     def _flat_pose(self, pose: Tensor, there: Tensor, values: Tensor) -> Tensor:
         """Pose coordinates, and 0 where they are reached with these parameters, too, else 1."""
-        reached = torch.isfinite(self.mechanism.solve_inverse(pose, values)).all(-1, keepdim=True)
+        reached = torch.isfinite(self._solve(pose, values)).all(-1, keepdim=True)
         return torch.cat([pose, torch.where(torch.logical_and(there, reached), 0.0, 1.0)], -1)
 
     def _coordinates(self, pose: Tensor, shift: Tensor) -> Tensor:
         """Pose coordinates `... x p` of a small shift `... x c` of the frame."""
         rows = pose.reshape(-1, pose.shape[-1])
-        found = self._closed[0].coordinates(rows, shift.reshape(-1, shift.shape[-1]))
+        shift = shift.reshape(-1, shift.shape[-1])
+        shift = shift if self._frames is None else self._frames.shift(rows, shift)
+        found = self._closed[0].coordinates(rows, shift)
         return found.reshape(pose.shape)
 
 
@@ -317,6 +395,19 @@ def _where_there(found: Tensor, aim: Tensor) -> Tensor:
     """A correction, 0 where the machine cannot take the pose."""
     there = torch.where(aim[..., -1:] <= 0, found, torch.zeros_like(found))
     return torch.where(torch.isfinite(found), there, torch.zeros_like(found))
+
+
+def closed_form_of(mechanism: Mechanism) -> str | None:
+    """Which direction of a machine a command can take: that of the machine inside, where it is seen through frames."""
+    if isinstance(mechanism, SerialArm):
+        return "forward"
+    if not isinstance(mechanism, Framed) or mechanism.grouped:
+        return mechanism.closed_form
+    inner = mechanism.mechanism
+    turns = inner.frame(inner.home_pose)[1] is not None
+    # Out of the plane, say, a frame may differ as no pose coordinate does.
+    fits = not turns if inner.closed_form == "forward" else len(inner.pose) == 6
+    return inner.closed_form if fits else None
 
 
 def build_machine(
@@ -339,11 +430,13 @@ def build_machine(
     Raises:
         InputError, MethodFailedError: as `expand`.
     """
-    if isinstance(mechanism, SerialArm) or mechanism.closed_form == "forward":
+    way = closed_form_of(mechanism)
+    if way == "forward":
         return Machine(mechanism, identified, effects, rule)
-    if mechanism.closed_form != "inverse":
+    if way is None:
         return None
-    start = expand(lambda q: mechanism.forward_kinematics(q), joints, margin, "pose", worst=_START)
+    inner = _inner(mechanism)
+    start = expand(lambda q: inner.forward_kinematics(q), joints, margin, "pose", worst=_START)
     made = InverseMachine(mechanism, identified, effects, rule, start)
     made.newton = max(one.steps_needed(joints, _MOST_NEWTON) for one in made._closed)
     return made

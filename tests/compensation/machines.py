@@ -17,7 +17,7 @@ from ccnn_torch.compensation import Compensator, build_machine, expand_effects, 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, reached
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
-from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism, read_urdf
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, load_mechanism, read_urdf
 from ccnn_torch.training import Scaling
 
 HALF = math.pi / 2
@@ -183,6 +183,19 @@ def parallel(name: str, error: float, most: float = 30.0) -> Known:
     return near(mechanism, error, joints[regular][:150], 2)
 
 
+def framed(name: str, tool: bool, effects: Sequence[str] = ()) -> Known:
+    """A machine of the library seen by a tracker that stands 3 m off and turned, frames off as well."""
+    bare = parallel(name, 2e-4)
+    machine = Framed(bare.mechanism, base=True, tool=tool)
+    values = machine.nominal.clone()
+    values[:6] = torch.tensor([3.0, 1.0, 0.5, 0.1, -0.2, 2.9])
+    if tool:
+        values[-6:] = torch.tensor([0.05, -0.02, 0.1, 0.4, 0.1, -0.3])
+    # Where what effects see is a polynomial; effects on poses count to first order, and these are small.
+    joints = 0.6 * bare.mechanism.home_joints + 0.4 * bare.joints
+    return with_effects(near(machine.with_nominal(values), 2e-4, joints), effects, (), 0.02)
+
+
 @cache
 def overconstrained() -> Known:
     """A machine without closed forms: its geometry is a polynomial, 0.1 mm and 0.1 mrad off."""
@@ -207,6 +220,8 @@ MACHINES: dict[str, Callable[[], Known]] = {
         parallel("five_bar", 2e-4, 8.0), ("compliance", "backlash"), ("load_x", "load_y", "direction1", "direction2")
     ),
     "stewart": lambda: parallel("stewart", 2e-4),
+    "framed stewart with effects": lambda: framed("stewart", True, ("joint_gain", "frame")),
+    "framed delta": lambda: framed("delta", False),
     "tripod": lambda: parallel("tripod", 2e-4),
     "tripod with effects": lambda: with_effects(parallel("tripod", 2e-4), ("joint_gain", "frame"), ()),
 }

@@ -67,7 +67,7 @@ def made_kind(kind: str, dtype: str = "float64", sd: bool = True) -> tuple[Compe
 
 
 # The kinds left out have operations and programs that these have, too; forms of machines are run in test_machine.py.
-_IN_C = ("covariates", "steep", "six joints", "polynomials", "sliding arm with effects", "scara", "stewart")
+_IN_C = ("covariates", "steep", "six joints", "polynomials", "sliding arm with effects", "scara", "framed stewart with effects")
 _IN_C += ("five-bar with effects", "constant", "gp", "enn", "grnn")
 
 
@@ -98,7 +98,7 @@ def test_single_precision_does_not_hold_a_machine() -> None:
         require_equal(*made(KINDS["sliding arm"](), "float32", sd=False))
 
 
-@pytest.mark.parametrize(("kind", "tables"), [("grnn", False), ("stewart", True)])
+@pytest.mark.parametrize(("kind", "tables"), [("grnn", False), ("framed stewart with effects", True)])
 def test_the_code_has_no_heap_no_recursion_and_no_state(kind: str, tables: bool, tmp_path: Path) -> None:
     for name, content in print_c99(*made_kind(kind)[1:]).items():
         (tmp_path / name).write_text(content)

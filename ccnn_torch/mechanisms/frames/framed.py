@@ -42,7 +42,7 @@ class Framed(Around):
     @property
     def unknown_frames(self) -> tuple[str, ...]:
         """The frames that are to be fitted to rows first: all, where they are by group or nominally the identity."""
-        base, _, tool = self._split(self.nominal)
+        base, _, tool = self.split(self.nominal)
         if not self.grouped and bool(base.any() or tool.any()):
             return ()
         return ("base",) * self.base + ("tool",) * self.tool
@@ -104,7 +104,7 @@ class Framed(Around):
 
     def _follow_nominal(self) -> None:
         """The mechanism's own nominal parameters; the box around 256 fixed samples, since frames turn it."""
-        self.mechanism.nominal.copy_(self._split(self.nominal)[1])
+        self.mechanism.nominal.copy_(self.split(self.nominal)[1])
         self.mechanism._follow_nominal()
         self.home_joints.copy_(self.mechanism.home_joints)
         self.home_pose.copy_(self.seen(self.mechanism.home_pose, self.nominal))
@@ -127,7 +127,7 @@ class Framed(Around):
         """The mechanism's pose of the joints, seen through both frames."""
         values = self.resolve(parameters)
         near = None if guess is None else self.mechanism.pose_near(*self.unseen(guess, values)).detach()
-        return self.seen(self.mechanism.forward_kinematics(joints, self._split(values)[1], near), values)
+        return self.seen(self.mechanism.forward_kinematics(joints, self.split(values)[1], near), values)
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x p`."""
@@ -147,12 +147,12 @@ class Framed(Around):
     ) -> Tensor:
         """As `solve_inverse` with another weight [m/rad]."""
         values = self.resolve(parameters)
-        return self.mechanism.solve_inverse(self._closest(pose, values, rotation_weight), self._split(values)[1], guess)
+        return self.mechanism.solve_inverse(self._closest(pose, values, rotation_weight), self.split(values)[1], guess)
 
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """The mechanism's Jacobian, turned by the base and carried to the tool; see `Mechanism.jacobian`."""
         values = self.resolve(parameters)
-        base, inner, tool = self._split(values)
+        base, inner, tool = self.split(values)
         near = None if guess is None else self.mechanism.pose_near(*self.unseen(guess, values))
         rows = self.mechanism.jacobian(joints, inner, near)
         turn = rotation_vector_to_matrix(base[..., 3:])
@@ -168,7 +168,7 @@ class Framed(Around):
         """Whether the mechanism reaches its closest pose; `...`, bool."""
         values = self.resolve(parameters)
         closest = self._closest(pose, values, self.rotation_weight)
-        return self.mechanism.reachable(closest, self._split(values)[1])
+        return self.mechanism.reachable(closest, self.split(values)[1])
 
     def inlying_frames(self, joints: Tensor, pose: Tensor, weights: Tensor | None = None) -> Tensor:
         """As `fitted_frames` to the rows that are no gross outliers; weights: `... x s`, 0 leaves a row out.
@@ -198,7 +198,7 @@ class Framed(Around):
             are nominal.
         """
         values = self.nominal.expand(*joints.shape[:-2], -1)
-        inner = self._split(self.nominal)[1]
+        inner = self.split(self.nominal)[1]
         guess = None
         # Iterative forward kinematics that start at home may end on another branch than from near the measured pose.
         for _ in range(2):
@@ -216,12 +216,12 @@ class Framed(Around):
 
     def _frames_between(self, here: Frame, measured: Frame, weights: Tensor) -> Tensor:
         """All parameters, `... x k`, with the free frames in closed form."""
-        inner = self._split(self.nominal)[1].expand(*weights.shape[:-1], -1)
+        inner = self.split(self.nominal)[1].expand(*weights.shape[:-1], -1)
         if self.base and not self.tool:
             return torch.cat([rigid_body_frame(here, measured, weights, self.rotation_weight), inner], dim=-1)
         assert here[1] is not None and measured[1] is not None  # a tool without orientation is refused
         if self.base:
-            tool = self._split(self.nominal)[2]
+            tool = self.split(self.nominal)[2]
             both = best_closed_form(here[1], here[0], measured, tool, weights, self.rotation_weight)
             return torch.cat([both[..., :6], inner, both[..., 6:]], dim=-1)
         share = (weights / weights.sum(-1, keepdim=True))[..., None]
@@ -230,7 +230,7 @@ class Framed(Around):
         turn = nearest_rotation((share[..., None] * (back @ measured[1])).sum(-3))
         return torch.cat([inner, place, matrix_to_rotation_vector(turn)], dim=-1)
 
-    def _split(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def split(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Base frame `... x 6`, the mechanism's parameters, tool frame `... x 6`; 0 where a frame is no parameter."""
         none = torch.zeros_like(values[..., :1]).expand(*values.shape[:-1], 6)
         first, last = 6 if self.base else 0, values.shape[-1] - (6 if self.tool else 0)
@@ -242,11 +242,11 @@ class Framed(Around):
 
     def own_values(self, values: Tensor) -> Tensor:
         """Of the parameters `... x k` those of the mechanism inside."""
-        return self._split(values)[1]
+        return self.split(values)[1]
 
     def seen(self, inner_pose: Tensor, values: Tensor) -> Tensor:
         """The mechanism's pose as the measuring device sees it, `... x p`."""
-        base, _, tool = self._split(values)
+        base, _, tool = self.split(values)
         position, rotation = self.mechanism.frame(inner_pose)
         if rotation is None:
             return base[..., :3] + (rotation_vector_to_matrix(base[..., 3:]) @ position[..., None])[..., 0]
@@ -259,7 +259,7 @@ class Framed(Around):
 
     def _unframed(self, seen: Frame, values: Tensor) -> Frame:
         """As `unseen`, of a frame."""
-        base, _, tool = self._split(values)
+        base, _, tool = self.split(values)
         position, rotation = seen
         turn = rotation_vector_to_matrix(base[..., 3:]).mT
         there = (turn @ (position - base[..., :3])[..., None])[..., 0]
