@@ -258,9 +258,12 @@ def test_an_interrupted_or_killed_run_resumes_to_identical_results(
             if about[1]["step"] == 8:
                 signal.raise_signal(signal.SIGINT)
 
+        # Under nohup it is ignored.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
         with monkeypatch.context() as patch:
             patch.setattr("ccnn_torch.training.trainer.save_checkpoint", interrupt)
             code, _, told = cli("run", TRIPOD, *STOPPED, f"out={stopped}")
+        signal.signal(signal.SIGINT, before)
         assert code == 130 and told.strip() == "interrupted; what was written so far is kept"
         assert not (stopped / "results.json").exists()
     assert cli("run", "--resume", stopped)[0] == 0

@@ -22,6 +22,8 @@ from ccnn_torch.training import Scaling
 
 # What is left of the equation q + δ(q) = q*, as a share of the limit.
 TOLERANCE = 1e-12
+# A bound of 0 takes any correction to 0.
+_TINY = 1e-30
 # What can be asked for.
 WAYS = ("command", "back", "sd")
 
@@ -244,6 +246,15 @@ class Compensator(nn.Module):
     def is_allowed(self, correction: Tensor) -> Tensor:
         """Whether a correction `... x n` [SI] is within the bound of the whole deviation, `... x 1`; NaN is not."""
         return (correction.abs() <= self.most * (1 + 1e-9)).all(-1, keepdim=True)
+
+    def shortened(self, correction: Tensor) -> Tensor:
+        """A correction `... x n` [SI] brought to the bound of the whole deviation, its direction kept.
+
+        Near a singular pose large motions of several joints cancel: bounded one by one they would miss by far more than
+        no correction does.
+        """
+        beyond = (correction.abs() / torch.clamp_min(self.most, _TINY)).amax(-1, keepdim=True)
+        return correction / torch.clamp_min(beyond, 1.0)
 
     def held(self, covariates: Tensor) -> Tensor:
         """Covariates held at the ends up to which effects follow them."""

@@ -313,7 +313,7 @@ class Functions:
         doubt = torch.zeros_like(weight)
         if own.machine is not None:
             wanted = own.machine.next_correction(q - correction + found, own.held(x), q, correction, aim)
-            bounded = own.machine.within(q, wanted, own.most)
+            bounded = own.machine.within(q, own.shortened(wanted), own.most)
             found, doubt = bounded, self._doubt(wanted, correction, aim)
         if own.effects is not None or own.geometry is not None:
             known = self.known(weight, caged)
@@ -350,8 +350,7 @@ class Functions:
         own = self.own
         assert own.machine is not None
         wanted = own.machine.next_back(q - correction, correction, aim)
-        bounded = torch.minimum(torch.maximum(wanted, -own.most), own.most)
-        return {"found": bounded, "doubt": self._doubt(wanted, correction, aim)}
+        return {"found": own.shortened(wanted), "doubt": self._doubt(wanted, correction, aim)}
 
     def finish(
         self,

@@ -402,8 +402,14 @@ def test_the_whole_deviation_has_a_bound_of_its_own() -> None:
     bounded = (found.deviation.abs() == made.most).any(-1)
     assert bool(bounded.any()) and bool((found.status[bounded] == DAMPED).all())
     assert bool((made.limit < compensated("arm").most).all())
-    # Half as much again as the largest one that is needed where rows were measured and around, more than these show.
     needed = solved(compensated("arm"), joints)
+    # All joints together: the command lies on the way to the exact one, and is better than none.
+    one, other = (v[bounded & (needed.status <= 1)] for v in (found.deviation, needed.deviation))
+    assert float(torch.cosine_similarity(one, other, -1).min()) > 0.99
+    frame, (at, still) = wanted(known("arm"), joints), (found.command, joints)
+    left, before = (apart(reached(known("arm"), made, v, joints[:, :0]), frame)[bounded] for v in (at, still))
+    assert bool((left < before).all())
+    # Half as much again as the largest one that is needed where rows were measured and around, more than these show.
     bound = compensated("arm").most / needed.deviation[needed.status <= 1].abs().amax(0)
     assert bool((bound > 1.2).all()) and bool((bound < 3).all()), bound
 

@@ -60,8 +60,9 @@ def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_th
     situation = situation_of(replace(records, pose=pose), arm)
     found = diagnose_rows(situation, pose)
     assert found.verdict["effects"] == ["geometry"] and not found.verdict["outside_library"]
+    # Of one channel the median of 150 rows tells it to a tenth.
     sigma = found.analysis.whitening.sigma
-    assert float(sigma.min()) > 0.8 * NOISE and float(sigma.max()) < 1.25 * NOISE, sigma
+    assert 0.8 * NOISE < float(sigma.square().mean().sqrt()) < 1.25 * NOISE, sigma
     told = found.effects[0]["parameters"]
     # The tool frame stands for the last link's length: nothing of it is left for the geometry.
     assert abs(told["d6"]["value"]) < 1e-4, told["d6"]
