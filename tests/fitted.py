@@ -8,8 +8,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis.joint_fit import fit_jointly
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.mechanisms.mechanism_file import chain_of
-from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector
 
 LIMITS = [(-1.5, 1.5), (-1.2, -0.3), (0.4, 1.6), (-1.5, 1.5), (0.3, 1.6), (-2.0, 2.0)]
 QUARTER = 1.5707963267948966
@@ -26,19 +24,8 @@ LINKS = [
 
 def six_axis_arm() -> SerialArm:
     """In the URDF form, its elbow and its wrist on one branch."""
-    return as_urdf(SerialArm("arm", "standard", LINKS, limits=LIMITS, tool=(0.05, 0.02, 0.1, 0.0, 0.0, 0.0)))
-
-
-def as_urdf(arm: SerialArm) -> SerialArm:
-    """The same arm with six parameters a link."""
-    base, origins, last = chain_of(arm)
-    links = [[*place.tolist(), *matrix_to_euler_zyx(turn).flip(-1).tolist()] for turn, place in origins]
-    ends = {
-        name: [*place.tolist(), *matrix_to_rotation_vector(turn).tolist()]
-        for name, (turn, place) in (("base", base), ("tool", last))
-    }
-    keys = {"convention": "urdf", "links": links, "leans": [], "tool_offset": None}
-    return SerialArm(**{**arm.recipe["keys"], **keys, **ends, "unknown_frames": list(arm.unknown_frames)})
+    tool = (0.05, 0.02, 0.1, 0.0, 0.0, 0.0)
+    return SerialArm("arm", "standard", LINKS, limits=LIMITS, tool=tool).with_link_frames()
 
 
 def fitted_geometry(

@@ -131,7 +131,7 @@ def test_an_arms_joints_are_those_of_the_previous_rows_branch(tmp_path: Path) ->
     assert float((load_records(tmp_path / "r.csv", at, learns=False).joints - records.joints).abs().max()) < 1e-9
     # The controller's tool is not what was measured, whatever form the links have.
     other = arm(tmp_path, "[0, 0.2, 0, 0, 0, 0]\ngoal_tool: identity")
-    for one in (other, other.with_leans()):
+    for one in (other, other.with_leans(), other.with_link_frames()):
         found = load_records(tmp_path / "r.csv", one, learns=False).joints
         assert float(machine.wrap(found - machine.commanded_joints(torch.from_numpy(pose))).abs().max()) < 1e-6
     longer = arm(tmp_path, "[0, 0, 0.1, 0, 0, 0]")

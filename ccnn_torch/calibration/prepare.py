@@ -230,7 +230,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
             f"methods: {unlearnable}; leave methods out, and geometry and effects alone are identified and corrected"
         )
     if isinstance(mechanism, SerialArm) and config.geometry != "none":
-        mechanism = mechanism.with_leans()
+        mechanism = mechanism.with_link_frames()
     held = rows_of_test_file(config.split, records.parts)
     pose = completed(mechanism, records.joints, records.pose)
     splits = _splits(config, mechanism.frame(pose)[0], records.columns, seeds, held, records.joints)

@@ -335,7 +335,7 @@ def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) ->
 def named_machine(said: Diagnosis) -> dict[str, Any] | None:
     """The entry `machine` of a diagnosis.json: effects and geometry that were named, fitted together to the rows.
 
-    Where geometry or a parameter is among the names, all parameters are identified. None where a
+    Where geometry or a parameter is among the names, all parameters are identified, six a link of an arm. None where a
     model can hold nothing of the verdict: no effect, one that needs the rows in order, several tools, or a simulator.
     A machine whose rows have a base frame for each group is that in its own base.
     """
@@ -356,6 +356,8 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         if verdict is None and drift is None and not identify:
             return None
         situation = on_fitted_frames(recorded)
+        if identify and isinstance(arm, SerialArm):
+            situation = _in_link_frames(situation)
         known = [] if verdict is None else [k for k in verdict.on(recorded)[0] if k.effect.kind != "parameters"]
         if beside:
             # Fitted beside, and left out: it is none of the machine.
@@ -382,6 +384,19 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
 def _is_beside(acting: Acting) -> bool:
     """Whether an effect is of these rows alone, and not of the machine that others meet."""
     return acting.effect.name in (FrameDrift.name, Homing.name)
+
+
+def _in_link_frames(situation: Situation) -> Situation:
+    """An arm with six parameters a link; groups of rows keep their base frames."""
+    arm, values = situation.mechanism, situation.parameters
+    assert isinstance(arm, SerialArm)
+    if values is None or values.dim() == 1:
+        return replace(situation, mechanism=arm.with_link_frames())
+    first = arm.with_nominal(values[0])
+    assert isinstance(first, SerialArm)
+    six = first.with_link_frames()
+    parameters = torch.cat([values[:, :6], six.nominal[6:].expand(len(values), -1)], -1)
+    return replace(situation, mechanism=six, parameters=parameters)
 
 
 def in_own_base(situation: Situation, values: Tensor) -> tuple[Situation, Tensor]:

@@ -13,7 +13,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
-from fitted import as_urdf
 from machines import known, parallel
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -131,7 +130,7 @@ def test_the_public_form_of_ur_description_is_read_the_same_way() -> None:
 
 @pytest.mark.parametrize("form", ["DH", "leans", "URDF", "URDF turned by half"])
 def test_ur_description_has_the_identified_arm(tmp_path: Path, form: str) -> None:
-    arm = as_urdf(ur10()) if form.startswith("URDF") else ur10()
+    arm = ur10().with_link_frames() if form.startswith("URDF") else ur10()
     arm = arm.with_leans() if form == "leans" else arm
     if form.endswith("half"):
         # As ur_description has it: base_link is turned by half against the first joint's frame.
@@ -347,7 +346,7 @@ def test_genserkins_has_the_identified_arm(tmp_path: Path, form: str) -> None:
     assert isinstance(arm, SerialArm)
     if form == "signs":
         arm = SerialArm(**{**arm.recipe["keys"], "joint_sign": [1, -1, 1, 1, -1, 1]})
-    arm = {"leans": SerialArm.with_leans, "URDF": as_urdf}.get(form, lambda same: same)(arm)
+    arm = {"leans": SerialArm.with_leans, "URDF": SerialArm.with_link_frames}.get(form, lambda same: same)(arm)
     path, real = identified(tmp_path, arm, 5e-4)
     files = export_model(path, "linuxcnc_hal", tmp_path / "out")
     pins, readme = read_hal(files["kinematics.hal"].read_text()), files["README.md"].read_text()

@@ -67,7 +67,15 @@ def made_kind(kind: str, dtype: str = "float64", sd: bool = True) -> tuple[Compe
 
 
 # The kinds left out have operations and programs that these have, too; forms of machines are run in test_machine.py.
-_IN_C = ("covariates", "steep", "six joints", "polynomials", "sliding arm with effects", "scara", "framed stewart with effects")
+_IN_C = (
+    "covariates",
+    "steep",
+    "six joints",
+    "polynomials",
+    "sliding arm with effects",
+    "scara",
+    "framed stewart with effects",
+)
 _IN_C += ("five-bar with effects", "constant", "gp", "enn", "grnn")
 
 

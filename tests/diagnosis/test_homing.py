@@ -89,7 +89,7 @@ def test_geometry_is_fitted_beside_it_and_the_machine_has_no_zero_of_a_day() -> 
     assert set(said.verdict["effects"]) == {"homing", "geometry"}
     machine = named_machine(said)
     assert machine is not None and not machine["effects"]
-    assert machine["parameters"]["a1"] == pytest.approx(LENGTHS[0] + 8e-4, abs=1e-5)
+    assert machine["parameters"]["x2"] == pytest.approx(LENGTHS[0] + 8e-4, abs=1e-5)
 
 
 def test_simulated_days_are_told_and_no_line_promises_to_correct_tomorrow(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from fitted import as_urdf, fitted_geometry
+from fitted import fitted_geometry
 
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms.dh_file import read_dh_file
@@ -45,7 +45,7 @@ def test_links_between_parallel_axes_have_a_lean(convention: str, tmp_path: Path
     moved = leaning.with_nominal(values)
     assert isinstance(moved, SerialArm)
     wanted = moved.forward_kinematics(joints)
-    torch.testing.assert_close(as_urdf(moved).forward_kinematics(joints), wanted, rtol=0, atol=1e-12)
+    torch.testing.assert_close(moved.with_link_frames().forward_kinematics(joints), wanted, rtol=0, atol=1e-12)
     (tmp_path / "arm.yaml").write_text(dh_text(moved))
     again = read_dh_file(str(tmp_path / "arm.yaml"))
     assert again.leans == (2, 3) and torch.equal(again.forward_kinematics(joints), wanted)
@@ -62,7 +62,7 @@ def test_groups_of_parallel_axes_lean_though_the_table_has_an_angle() -> None:
 def test_a_tilt_between_parallel_axes_needs_them() -> None:
     limits = [(-2.0, 2.0)] * 5
     arm = SerialArm("arm", "standard", LINKS, limits=limits, unknown_frames=["base", "tool"])
-    full = as_urdf(arm)
+    full = arm.with_link_frames()
     truth = full.nominal.clone()
     truth[[p.name for p in full.geometry].index("pitch3")] += 2e-3
     joints = arm.sample_joints(150, torch.Generator().manual_seed(2))

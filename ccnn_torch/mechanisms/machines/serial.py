@@ -32,6 +32,7 @@ from ccnn_torch.mechanisms.newton import carry_derivative, nearest
 from ccnn_torch.mechanisms.pose import frame_gap
 from ccnn_torch.numerics.batching import expand_leading, stack_last
 from ccnn_torch.numerics.rotations import (
+    matrix_to_euler_zyx,
     matrix_to_rotation_vector,
     rotation_vector_rate,
     rotation_vector_to_matrix,
@@ -242,6 +243,43 @@ class SerialArm(Mechanism):
         twin.nominal.copy_(torch.cat([self.nominal[:own], added, self.nominal[behind:]]))
         twin._follow_nominal()
         return twin
+
+    def with_link_frames(self) -> SerialArm:
+        """The same arm with six parameters a link, in the URDF form, nominal parameters and kinematics unchanged.
+
+        They do what those of a table with its leans do, and every link may be off in every direction: with priors the
+        better ones on measured arms. The nominal tool frame takes in the constant part of the last link; frames that
+        are unknown stay so.
+        """
+        if self.convention == "urdf":
+            return self
+        keys, zero = self.recipe["keys"], torch.zeros(len(self.joints), dtype=torch.float64)
+        rotations, places = self.link_transforms(zero, self.nominal)
+        angles = matrix_to_euler_zyx(rotations).flip(-1)
+        links = torch.cat([places, angles], dim=-1)
+        before = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+        if self._axis_before:
+            links = torch.cat([torch.zeros_like(links[:1]), links[:-1]])
+            before = rotations[-1], places[-1]
+
+        def from_last(frame: Tensor) -> list[float]:
+            turn, place = compose(before, (rotation_vector_to_matrix(frame[3:]), frame[:3]))
+            return [*place.tolist(), *matrix_to_rotation_vector(turn).tolist()]
+
+        goal = keys.get("goal_tool")
+        return SerialArm(
+            **{
+                **keys,
+                "convention": "urdf",
+                "leans": [],
+                "links": links.tolist(),
+                "base": self.nominal[:6].tolist(),
+                "tool": from_last(self.nominal[-6:]),
+                "goal_tool": None if goal is None else from_last(torch.tensor(goal, dtype=torch.float64)),
+                "tool_offset": None,
+                "unknown_frames": list(self.unknown_frames),
+            }
+        )
 
     def with_orientation(self, orientation: str) -> SerialArm:
         """The same arm, nominal parameters included, for poses of another kind: "none", "direction" …"""
