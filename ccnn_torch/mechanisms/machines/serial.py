@@ -140,8 +140,7 @@ class SerialArm(Mechanism):
         Raises:
             InputError: unknown convention or orientation.
         """
-        keys = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
-        keys = {k: v for k, v in keys.items() if v or k not in ("goal_tool", "tables", "leans")}
+        every = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         if convention not in LINKS or orientation not in ("rotation_vector", "none", "direction"):
             raise InputError(
                 f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector', 'none' or "
@@ -156,21 +155,19 @@ class SerialArm(Mechanism):
         n, types = len(links), tuple(joint_types or ["revolute"] * len(links))
         self._transform, _, _, self._axis_before = LINKS[convention]
         pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
-        shown = {c for c, _ in pose}
         geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(FRAME, base, strict=True)]
         joint_units = ["rad" if t == "revolute" else "m" for t in types]
         own = links_and_drives(convention, links, joint_units, drives, leans)
         if orientation == "direction" and n == len(MOUNT):
             named = {f"{p}{i}": sense for i, senses in enumerate(MOUNT, 1) for p, sense in senses.items()}
             own = [replace(p, sense=named.get(p.name, "")) for p in own]
-        count = len(own)
         start, shares = _start_and_shares(own, numbers)
         if numbers:
             own = [Parameter(**{k: v for k, v in number.items() if k != "of"}) for number in numbers]
             geometry = [replace(p, held="base" not in unknown) for p in geometry]
         geometry += own
         geometry += [
-            Parameter(f"tool_{c}", u, v, held=bool(numbers) and ("tool" not in unknown or c not in shown))
+            Parameter(f"tool_{c}", u, v, held=bool(numbers) and ("tool" not in unknown or (c, u) not in pose))
             for (c, u), v in zip(FRAME, tool, strict=True)
         ]
         super().__init__(
@@ -193,13 +190,13 @@ class SerialArm(Mechanism):
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
         self.own_drives = Drives(drives, tables or [None] * n)
         self.drives, self._named = tuple(map(tuple, drives)), bool(numbers)
-        self.leans, self._links_size = tuple(int(i) for i, _ in leans), count - len(drives) - len(leans)
+        self.leans, self._links_size = tuple(int(i) for i, _ in leans), len(start) - len(drives) - len(leans)
         self.register_buffer("_start", start, persistent=False)
         self.register_buffer("_shares", shares, persistent=False)
-        which = torch.eye(n, dtype=torch.float64)[[int(i) - 1 for i, _ in leans]]
-        self.register_buffer("_leaning", which, persistent=False)
+        self.register_buffer("_leaning", torch.eye(n).double()[[i - 1 for i in self.leans]], persistent=False)
         self.register_buffer("counting", counting(convention, n, orientation == "direction"))
-        self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
+        told = {k: v for k, v in every.items() if v or k not in ("goal_tool", "tables", "leans")}
+        self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(told))}
         self._follow_nominal()
 
     def _follow_nominal(self) -> None:
