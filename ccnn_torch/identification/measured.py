@@ -162,8 +162,9 @@ class Measured:
 def nominal_machine(config: IdentifyConfig) -> Mechanism:
     """The mechanism that the config names, an arm with the parameters of its links that it asks for."""
     mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
-    lean = config.links == "lean" and isinstance(mechanism, SerialArm)
-    return mechanism.with_leans() if lean else mechanism
+    if config.links == "lean" and isinstance(mechanism, SerialArm):
+        return mechanism.with_leans()
+    return mechanism
 
 
 def held_by_priors(config: IdentifyConfig, mechanism: Mechanism) -> bool:

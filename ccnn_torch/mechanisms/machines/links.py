@@ -153,8 +153,8 @@ def links_and_drives(
         ]
     for link, lean in leans:
         i = int(link)
-        at, to = (i, i + 1) if convention == "standard" else (i - 1, i)
-        found.append(Parameter(f"beta{i}", "rad", lean, sense=f"lean of axis {to} against axis {at}"))
+        first = i if convention == "standard" else i - 1
+        found.append(Parameter(f"beta{i}", "rad", lean, sense=f"lean of axis {first + 1} against axis {first}"))
     for i, j in drives:
         to, by = joint_units[i - 1], joint_units[j - 1]
         found.append(Parameter(f"drive{i}{j}", "1" if to == by else f"{to}/{by}", 0.0, scale=_DRIVE))
