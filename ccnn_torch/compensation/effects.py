@@ -14,6 +14,9 @@ from ccnn_torch.compensation.kinematics import ClosedKinematics, inverse
 from ccnn_torch.effects import Acting, Situation, labelled, make_effect
 from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
 
+# Share by which a polynomial of what an effect looks at may be off: that share of an effect, which is small itself, is
+# then missed, and held-out rows are commanded with it.
+_OF_EFFECT = 0.03
 _WHAT = "kinematics that the effects need"
 _NAMES = (
     "jacobian",
@@ -199,7 +202,8 @@ def make_fields(mechanism: Mechanism, gravity: Tensor, names: set[str], joints: 
             start = expand(lambda q: Situation(mechanism, q, {}, gravity).pose, joints, margin, _WHAT, worst=_START)
         source = ClosedKinematics(mechanism, start)
     elif layout:
-        source = expand(flat, joints, margin, _WHAT, [math.prod(shape) for _, shape in layout])
+        groups = [math.prod(shape) for _, shape in layout]
+        source = expand(flat, joints, margin, _WHAT, groups, _OF_EFFECT)
     return Fields(layout, source, constants, whole.samples)
 
 
