@@ -316,6 +316,10 @@ def test_keys_that_do_not_go_together(played: Path, tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=rf"compensation\.ends\.{sentence}"):
             prepare(RunConfig.from_keys(**keys(played, compensation={"ends": ends})))
+    # Without any effect nothing follows a covariate.
+    told = {"ends": {"load_x": ["-1 kN", "1 kN"]}}
+    made = calibrate(**keys(played, effects="none", geometry="none", compensation=told))
+    assert made.compensator().machine is None
 
 
 def test_paths_start_where_the_key_stands(played: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -253,8 +253,8 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
     physics = {} if prepared.physics is None else prepared.physics.modules(repeat, there, margin, names)
     if "machine" in physics:
         physics["machine"].ends = ends_of(config, prepared.covariate_coordinates)
-    elif config.compensation.ends:
-        raise InputError("compensation.ends: effects of this machine are fitted to what was measured; remove the key")
+    elif config.compensation.ends and physics.get("effects") is not None:
+        raise MethodFailedError("compensation.ends: effects of this machine are fitted to what was measured; remove it")
     if physics and "machine" not in physics and limit is None:
         # What geometry and effects leave at singular poses can be larger than what was there.
         limit = default_limit(prepared.total[repeat, there])

@@ -26,6 +26,8 @@ from ccnn_torch.records.headers import Header, is_number, read_header
 from ccnn_torch.records.table import PAYLOAD, Table, name_lines
 from ccnn_torch.units import STANDARD_GRAVITY, as_read, split_header, to_si
 
+# Units of a payload that is a mass.
+_MASSES = ("kg", "g", "lb")
 SEPARATORS = ",;\t"
 """What may stand between the cells of a line of text."""
 
@@ -350,9 +352,6 @@ def _with_load(table: Table) -> Table:
         bad_cells=table.bad_cells | bad,
         notes=(*table.notes, note),
     )
-
-
-_MASSES = ("kg", "g", "lb")
 
 
 # What a line without cells is made of.
