@@ -369,6 +369,9 @@ def test_a_gross_outlier_is_not_learned_from_and_is_judged_where_it_is_held_out(
     assert flagged == wrong[:1]
     assert not bool(rows.dataset.usable[0, wrong[0]]) and bool(rows.dataset.usable[0, wrong[1]])
     assert any("misses them by more than ten times the usual" in note for note in rows.notes)
+    position = calibrate(**keys(played, records=str(tmp_path / "rows.csv"))).results["pose"]["position"]
+    others = position["without_outliers"]
+    assert others["rows"] == 1 and 10 * others["after"]["median"] < position["after"]["rms"]["median"]
 
 
 def test_rows_that_no_machine_takes_are_one_sentence(tmp_path: Path) -> None:

@@ -92,6 +92,10 @@ def verdict(results: RunResults) -> str:
     left, right, unit = _both(before.median, after.median)
     did = f"removes {removed:.1f} %" if removed >= 0 else f"adds {-removed:.1f} %"
     text = f"On {rows} {whose} {did} of the RMS position error ({left} → {right} {unit})"
+    others = position.without_outliers
+    if others is not None:
+        left, right, unit = _both(others.before.median, others.after.median)
+        text += f"; {left} → {right} {unit} without {count_text(others.rows, 'row')} far from every model"
     ratio = methods[best].ratio_to_floor if best in methods else None
     if ratio is not None and ratio.median is not None:
         text += f"; its mean squared joint error is {number_text(ratio.median, 3)} times the noise floor"

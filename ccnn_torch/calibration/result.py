@@ -29,6 +29,7 @@ from ccnn_torch.calibration.statistics import (
 )
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.report.results.base import Axis, Spread
 from ccnn_torch.report.results.run import (
     Floor,
@@ -40,6 +41,7 @@ from ccnn_torch.report.results.run import (
     RecordRows,
     RowCounts,
     RunResults,
+    WithoutOutliers,
 )
 from ccnn_torch.simulation.case_study import Simulation
 
@@ -264,9 +266,16 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, outcome: Out
     }
     found = {name: _held_out(prepared, error) for name, error in errors.items() if error is not None}
     weights = found["before"][1]
-    return pose_block(
+    pose = pose_block(
         weights=weights, rotation_weight=config.rotation_weight, **{name: error for name, (error, _) in found.items()}
     )
+    models = torch.stack([error.position for name, (error, _) in found.items() if name != "not_compensable"])
+    far = (weights > 0) & ~inlying(models.nan_to_num(torch.inf).amin(0), weights > 0, 3, 0)
+    if not bool(far.any()):
+        return pose
+    others = pose_block(found["before"][0], found["after"][0], weights * ~far).position
+    told = WithoutOutliers(rows=int(far.sum(1).max()), before=others.before.rms, after=others.after.rms)
+    return pose.model_copy(update={"position": pose.position.model_copy(update={"without_outliers": told})})
 
 
 def _effects(prepared: Prepared, physics: Physics, test: Rows) -> KnownEffects:

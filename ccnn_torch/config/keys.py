@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
@@ -129,7 +129,7 @@ def _other_command(file: str, model: type[BaseModel]) -> str:
     return next((f"a config for `ccnn {name}{_OPTION.get(name, '')}`" for name in names), "")
 
 
-def _sentence(key: str, kind: str, message: str, value: Any, keys: Mapping[str, str], also: Iterable[str]) -> str:
+def _sentence(key: str, kind: str, message: str, value: Any, keys: Mapping[str, str], also: Collection[str]) -> str:
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"there is no key '{key}'; {_hint(key, keys, also)}"
     if kind in ("model_type", "dataclass_type", "dict_type"):
@@ -146,7 +146,9 @@ def _sentence(key: str, kind: str, message: str, value: Any, keys: Mapping[str, 
     return f"{key}: {text}, not {_short(value)}"
 
 
-def _hint(key: str, keys: Mapping[str, str], also: Iterable[str]) -> str:
+def _hint(key: str, keys: Mapping[str, str], also: Collection[str]) -> str:
+    if key in also:
+        return "only `ccnn run` has it; leave it out"
     section, _, last = key.rpartition(".")
     beside = _below(section, keys)
     near = nearest(last, beside, 0.65)

@@ -71,3 +71,14 @@ def test_a_verdict_without_its_unsure_second_name_is_as_likely_as_its_first(tmp_
     # Which of several small corrections of its form goes with it is not known; none of them is named.
     best = found.judgement.leading[0]
     assert best.names > {"instrument"} and best.probability < 0.9 and found.verdict["probability"] == pytest.approx(0.9)
+
+
+def test_backlash_stays_a_candidate_without_what_should_only_mend_its_form(tmp_path):
+    """Its edges take so much beside a load that they cannot be but corrections: that is no reason to call it another
+    name."""
+    case = make("pair_8", 920)
+    write_table(tmp_path / "records.csv", dict(case.columns))
+    mechanism, noise = _mechanism(case, tmp_path), case.noise
+    told = {c.name: noise[c.unit] for c in mechanism.pose if c.unit in noise}
+    found = diagnose(load_records(tmp_path / "records.csv", mechanism, learns=False), mechanism, noise=told)
+    assert {*found.verdict["effects"]} == {"compliance", "backlash"}

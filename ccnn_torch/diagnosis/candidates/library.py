@@ -81,6 +81,7 @@ def candidates_about_nominal(
         for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(without_unused_rows(_atom(situation, situation, atom.effect, shaped), usable))
+    starts += without_secondary(situation, starts)
     starts += _in_few_joints(situation, starts, white, residual)
     return [*map(_charged, [*whole, *parts]), *starts]
 
@@ -156,6 +157,7 @@ def candidates_about_set(
         for shaped in shapes:
             if not any(_same_shape(a, shaped) for a in own):
                 own.append(without_unused_rows(_atom(situation, there, effect, shaped), usable))
+        own += without_secondary(situation, own)
         atoms += [*own, *_in_few_joints(situation, own, white, beside(others))]
     return atoms
 
@@ -279,15 +281,15 @@ def _in_few_joints(situation: Situation, shaped: Sequence[Atom], white: Whitenin
 def without_secondary(situation: Situation, atoms: Sequence[Atom]) -> list[Atom]:
     """Of the effects that have secondary coefficients the others alone, and all but those that only mend a form.
 
-    One scale for all would charge for the zeros of joints that count from the middle, and a term of no effect would
+    Of effects with shapes only the latter: what else is secondary in them is the search's choice. One scale for all would charge for the zeros of joints that count from the middle, and a term of no effect would
     then be the cheaper name for their gains.
     """
     found = []
-    for atom in atoms:
+    for atom in (a for a in atoms if a.used is None):
         coefficients = atom.coefficients(situation)
         main = [k for k, c in enumerate(coefficients) if not c.secondary]
         formed = [k for k, c in enumerate(coefficients) if not c.mends]
-        parts = [main] if main == formed else [main, formed]
+        parts = [formed] if main == formed or atom.shape.numel() else [main, formed]
         found += [_with(atom, part, _EITHER) for part in parts if 0 < len(part) < len(coefficients)]
     return found
 

@@ -67,14 +67,16 @@ class Judgement:
 
 def judge_rows(analysis: Analysis) -> Judgement:
     """Weigh the sets that the search has found."""
-    levels = with_form_error(analysis.dictionary, analysis.found[0], analysis.floor, analysis.noise_is_known)
-    usual, every = levels[0], _explanations(analysis, levels, frozenset())
+    dictionary, found = analysis.dictionary, analysis.found
+    levels = with_form_error(dictionary, found[0], analysis.floor, analysis.noise_is_known)
+    usual, every = levels[0], _explanations(analysis, levels)
     leading = every
-    # Effects that are supported by aliased coefficients alone are no candidates.
-    without: frozenset[str] = frozenset()
-    while borrowed := borrowed_names(analysis, usual, leading[0].best):
-        without |= borrowed
-        leading = _explanations(analysis, levels, without)
+    # Candidates that are supported by aliased coefficients alone are none: the others are searched without them.
+    while borrowed := borrowed_candidates(analysis, usual, leading[0].best):
+        dictionary = replace(dictionary, groups={i: g for i, g in dictionary.groups.items() if i not in borrowed})
+        found = [f for f in found if not borrowed & {*f.members}]
+        levels = with_form_error(dictionary, found[0], analysis.floor, analysis.noise_is_known)
+        usual, leading = levels[0], _explanations(analysis, levels)
     refitted = _fits(analysis.dictionary, [e.best.members for e in leading], {f.members: f for f in analysis.found})
     leading = [replace(e, best=fit) for e, fit in zip(leading, refitted, strict=True)]
 
@@ -205,18 +207,15 @@ def without_names(analysis: Analysis, judgement: Judgement) -> Judgement:
     return replace(judgement, found=empty, acting=empty, fullest=empty, names=(), classes={}, probability=0.5)
 
 
-def _explanations(
-    analysis: Analysis, levels: Sequence[Posterior], without: frozenset[str]
-) -> list[Explanation[FittedSet]]:
-    """Of the sets at each level of the form error; without: names of none of them."""
+def _explanations(analysis: Analysis, levels: Sequence[Posterior]) -> list[Explanation[FittedSet]]:
+    """Of the sets at each level of the form error."""
 
     def probable(found: Sequence[FittedSet]) -> Iterator[tuple[frozenset[str], tuple[str, ...], float, FittedSet]]:
         """Of the sets that say the same the most probable one: a search of shapes has charged the others."""
         seen = set()
-        allowed = [f for f in found if not without & _named(analysis, f)[0]]
-        for one in allowed:
+        for one in found:
             key = _named(analysis, one)
-            if key not in seen and one.log_posterior > allowed[0].log_posterior - _FAR:
+            if key not in seen and one.log_posterior > found[0].log_posterior - _FAR:
                 seen.add(key)
                 yield *key, one.log_posterior, one
 
@@ -273,10 +272,10 @@ def _second_driver(analysis: Analysis, posterior: Posterior, found: FittedSet) -
     return (atoms[best].name,) if odds > 0 else ()
 
 
-def borrowed_names(analysis: Analysis, posterior: Posterior, found: FittedSet) -> frozenset[str]:
-    """Names of a set that rest on what other effects do as well, or on what should only correct their form, or that
-    would be of a size beside others that no cause has."""
-    dictionary, names, most = posterior.dictionary, set(), implausible_size(analysis)
+def borrowed_candidates(analysis: Analysis, posterior: Posterior, found: FittedSet) -> frozenset[int]:
+    """Members of a set that rest on what other effects do as well, or on what should only correct their form; and all
+    of a name that would be of a size beside others that no cause has."""
+    dictionary, borrowing, most = posterior.dictionary, set[int](), implausible_size(analysis)
     for i, mean in zip(found.members, found.mean, strict=True):
         atom, group = analysis.atoms[i], dictionary.groups[i]
         if atom.is_discrepancy:
@@ -284,7 +283,7 @@ def borrowed_names(analysis: Analysis, posterior: Posterior, found: FittedSet) -
         coefficients = atom.coefficients(analysis.situation)
         main_sizes = [abs(float(v)) for c, v in zip(coefficients, mean, strict=True) if not c.secondary]
         if len(found.members) > 1 and max(main_sizes, default=0.0) > most:
-            names.add(atom.name)
+            borrowing |= {k for k in dictionary.groups if analysis.atoms[k].name == atom.name}
             continue
         if not any(c.borrowed or c.mends for c in coefficients):
             continue
@@ -297,8 +296,8 @@ def borrowed_names(analysis: Analysis, posterior: Posterior, found: FittedSet) -
         alone, main, whole = (float(m @ gram @ m) for m in parts)
         largest, mended = (float((mean * kind).abs().max()) for kind in (~corrections, corrections))
         if alone < _OWN * whole or (main < _MAIN * whole and mended > _MENDED * largest):
-            names.add(atom.name)
-    return frozenset(names)
+            borrowing.add(i)
+    return frozenset(borrowing)
 
 
 def implausible_size(analysis: Analysis) -> float:

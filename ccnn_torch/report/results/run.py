@@ -111,6 +111,13 @@ class Auto(Result):
     why: str
 
 
+class WithoutOutliers(Result):
+    rows: int
+    """held-out rows that are far from every model, in the repeat that has most"""
+    before: Spread
+    after: Spread
+
+
 class PoseFigures(Result):
     unit: Length
     before: RmsMax
@@ -124,6 +131,8 @@ class PoseFigures(Result):
     """known effects alone, with geometry"""
     not_compensable: RmsMax | None = None
     """what no joint deviation explains"""
+    without_outliers: WithoutOutliers | None = None
+    """RMS on the other rows, where some are gross outliers"""
 
 
 class Energy(PoseFigures):
