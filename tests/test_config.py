@@ -238,6 +238,11 @@ def test_unreadable_file(tmp_path: Path) -> None:
         RunConfig.from_file(tmp_path / "latin.yaml")
 
 
+def test_a_key_of_another_command_is_told_so() -> None:
+    with pytest.raises(InputError, match="there is no key 'save_report'; only `ccnn run` has it; leave it out"):
+        DiagnoseConfig.from_keys(records="rows.csv", mechanism="five_bar", save_report=False)
+
+
 def test_make_config_is_checked_too() -> None:
     assert RunConfig.from_keys(case="tripod", ccnn={"generations": 60}).ccnn.generations == 60
     with pytest.raises(InputError, match=r"config: there is no key 'sed'; did you mean 'seed'\?"):
@@ -257,11 +262,6 @@ def test_make_config_is_checked_too() -> None:
     )
 )
 @example("a\x85b")
-def test_a_key_of_another_command_is_told_so() -> None:
-    with pytest.raises(InputError, match="there is no key 'save_report'; only `ccnn run` has it; leave it out"):
-        DiagnoseConfig.from_keys(records="rows.csv", mechanism="five_bar", save_report=False)
-
-
 def test_yaml_round_trip(value: object) -> None:
     back = parse_yaml(dump_yaml({"value": value}), "dump")["value"]
     assert back == value and repr(back) == repr(value)

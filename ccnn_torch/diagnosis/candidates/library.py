@@ -281,8 +281,9 @@ def _in_few_joints(situation: Situation, shaped: Sequence[Atom], white: Whitenin
 def without_secondary(situation: Situation, atoms: Sequence[Atom]) -> list[Atom]:
     """Of the effects that have secondary coefficients the others alone, and all but those that only mend a form.
 
-    Of effects with shapes only the latter: what else is secondary in them is the search's choice. One scale for all would charge for the zeros of joints that count from the middle, and a term of no effect would
-    then be the cheaper name for their gains.
+    Of effects with shapes only the latter: what else is secondary in them is the search's choice. One scale for all
+    would charge for the zeros of joints that count from the middle, and a term of no effect would then be the cheaper
+    name for their gains.
     """
     found = []
     for atom in (a for a in atoms if a.used is None):

@@ -67,22 +67,22 @@ class Judgement:
 
 def judge_rows(analysis: Analysis) -> Judgement:
     """Weigh the sets that the search has found."""
-    dictionary, found = analysis.dictionary, analysis.found
-    levels = with_form_error(dictionary, found[0], analysis.floor, analysis.noise_is_known)
+    dictionary, sets = analysis.dictionary, analysis.found
+    levels = with_form_error(dictionary, sets[0], analysis.floor, analysis.noise_is_known)
     usual, every = levels[0], _explanations(analysis, levels)
     leading = every
     # Candidates that are supported by aliased coefficients alone are none: the others are searched without them.
     while borrowed := borrowed_candidates(analysis, usual, leading[0].best):
         dictionary = replace(dictionary, groups={i: g for i, g in dictionary.groups.items() if i not in borrowed})
-        found = [f for f in found if not borrowed & {*f.members}]
-        levels = with_form_error(dictionary, found[0], analysis.floor, analysis.noise_is_known)
+        sets = [f for f in sets if not borrowed & {*f.members}]
+        levels = with_form_error(dictionary, sets[0], analysis.floor, analysis.noise_is_known)
         usual, leading = levels[0], _explanations(analysis, levels)
     refitted = _fits(analysis.dictionary, [e.best.members for e in leading], {f.members: f for f in analysis.found})
     leading = [replace(e, best=fit) for e, fit in zip(leading, refitted, strict=True)]
 
     def fitted(explanation: Explanation[FittedSet]) -> FittedSet:
         """Of the shapes that form errors do not tell apart those that fit best."""
-        same = (f for f in analysis.found if _named(analysis, f) == (explanation.names, explanation.drivers))
+        same = (f for f in sets if _named(analysis, f) == (explanation.names, explanation.drivers))
         return max([explanation.best, *same], key=lambda f: f.log_posterior)
 
     verdict = judge(leading, every, lambda e: rest_of(analysis, fitted(e)))
@@ -98,7 +98,7 @@ def judge_rows(analysis: Analysis) -> Judgement:
     more = sorted(
         (
             f
-            for f in analysis.found
+            for f in sets
             if found.members and set(found.members) <= set(f.members) and not alike & _named(analysis, f)[0]
         ),
         key=lambda f: -f.log_posterior,
