@@ -20,5 +20,9 @@ from ccnn_torch.identification.problems.problem import (
 )
 from ccnn_torch.identification.solvers import SOLVERS as SOLVERS, get_solver as get_solver
 from ccnn_torch.identification.solvers.lm import LOSSES as LOSSES, reweighted as reweighted, solve_lm as solve_lm
-from ccnn_torch.identification.solvers.tikhonov import solve_tikhonov as solve_tikhonov
+from ccnn_torch.identification.solvers.tikhonov import (
+    LCurve as LCurve,
+    l_curve as l_curve,
+    solve_tikhonov as solve_tikhonov,
+)
 from ccnn_torch.mechanisms.frames.part import tool_points as tool_points

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -11,17 +13,43 @@ from ccnn_torch.identification.problems.problem import Fit, Problem, Progress, W
 _TRIED, _LEAST = 200, 1e-10
 
 
-def _corner(rows: WeightedRows) -> Tensor:
-    """The change du from the start, in plausible errors, `r x k`, that minimises |J du + residual|² + α² |du|².
+@dataclass(frozen=True)
+class LCurve:
+    """Residual against size of the change, of `r` machines and `w` regularisation weights.
 
-    α is that of the corner, where log size against log misfit bends most (Hansen and O'Leary 1993); all derivatives are
-    exact. Rows of J are those of the priors, too.
+    Attributes:
+        weight: α, falling, `r x w` [1].
+        misfit: |J du + residual|, `r x w` [1], rows of the priors included.
+        size: |du| of the parameters in plausible errors, `r x w` [1].
+        corner: index of the weight taken, `r`.
+        step: du at the corner, `r x k`.
     """
-    values = rows.start
+
+    weight: Tensor
+    misfit: Tensor
+    size: Tensor
+    corner: Tensor
+    step: Tensor
+
+
+def l_curve(problem: Problem, values: Tensor) -> LCurve:
+    """Minimise |J du + residual|² + α² |du|² for a range of α, the parameters in plausible errors.
+
+    The corner is where log size against log misfit bends most (Hansen and O'Leary 1993); all derivatives are exact.
+
+    Args:
+        problem: with or without priors, which are rows of J like others.
+        values: where to linearise, `r x k` [SI].
+
+    Raises:
+        InputError: the residual is not finite there.
+    """
+    rows = WeightedRows(problem)
     residual, slope = rows.linearised(values)
     if rows.has_prior:
-        residual = torch.cat([residual, torch.zeros_like(values)], dim=-1)
-        slope = torch.cat([slope, torch.diag(rows.pull.sqrt()).expand(len(values), -1, -1)], dim=-2)
+        pull = rows.pull.sqrt()
+        residual = torch.cat([residual, pull * (values - problem.start) / problem.scale], dim=-1)
+        slope = torch.cat([slope, torch.diag(pull).expand(len(values), -1, -1)], dim=-2)
     left, singular, right = torch.linalg.svd(slope, full_matrices=False)
     share = -(left.mT @ residual[..., None])[..., 0]
     beyond = (residual.square().sum(-1) - share.square().sum(-1)).clamp_min(0)
@@ -35,7 +63,8 @@ def _corner(rows: WeightedRows) -> Tensor:
     misfit2 = beyond[:, None] + ((1 - passed) * share[:, None]).square().sum(-1)
     corner = _curvature(weight, passed, part, size2, misfit2).argmax(-1)
     pick = torch.arange(len(values), device=values.device), corner
-    return (part[pick][:, None] @ right)[:, 0]
+    step = (part[pick][:, None] @ right)[:, 0]
+    return LCurve(weight, misfit2.sqrt(), size2.sqrt(), corner, step)
 
 
 def solve_tikhonov(problem: Problem, seed: int = 0, progress: Progress | None = None) -> Fit:
@@ -50,8 +79,9 @@ def solve_tikhonov(problem: Problem, seed: int = 0, progress: Progress | None = 
     Raises:
         InputError: the residual is not finite at the start.
     """
+    curve = l_curve(problem, problem.start)
+    values = problem.start + problem.scale * curve.step
     rows = WeightedRows(problem)
-    values = problem.start + problem.scale * _corner(rows)
     everyone = torch.arange(len(values), device=values.device)
     cost = rows.cost(values[:, None], everyone)[:, 0]
     within = torch.isfinite(cost)
