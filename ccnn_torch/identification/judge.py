@@ -12,7 +12,7 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from ccnn_torch.display import display_unit, number_text
+from ccnn_torch.display import number_text, with_unit
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.measured import Measured, Rows, read_records, rows_of_split, split_records
@@ -215,8 +215,8 @@ def doubts_of(
         return said
     if noise is not None and after > _ABOVE_NOISE * noise:
         said.append(
-            f"The held-out position error is still {after / noise:.3g} times the noise ({_length(after)}, "
-            f"{_length(noise)}): something else is wrong beside the geometry that was identified."
+            f"The held-out position error is still {after / noise:.3g} times the noise ({with_unit(after, 'm')}, "
+            f"{with_unit(noise, 'm')}): something else is wrong beside the geometry that was identified."
         )
     if before > 0 and after > _LITTLE_GAINED * before:
         said.append(
@@ -224,11 +224,6 @@ def doubts_of(
             "explains little of it."
         )
     return said
-
-
-def _length(value: float) -> str:
-    scale, unit = display_unit("m", value)
-    return f"{number_text(value / scale, 3)} {unit}"
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from torch import Tensor
 from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.diagnosis.candidates.atom import Atom, scaled_signature
 from ccnn_torch.diagnosis.residual.whitening import moving_channels, without_fitted
-from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.display import count_text, display_unit, with_unit
 from ccnn_torch.effects import (
     Coefficient,
     Situation,
@@ -446,10 +446,9 @@ def _best(rows: _Rows, there: Situation, asked: Candidates, separates: list[str]
 
 def since_text(results: SinceResults) -> str:
     """The verdict in two or three sentences."""
-    scale, unit = display_unit(results.position.unit, results.position.before)
     what = "position" if results.position.unit == "m" else "direction"
     before, after, promised = (
-        None if v is None else f"{number_text(v / scale, 3)} {unit}"
+        with_unit(v, results.position.unit, like=results.position.before)
         for v in (results.position.before, results.position.after, results.position.promised)
     )
     rows = count_text(results.rows, "new row")
