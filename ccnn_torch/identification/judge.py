@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -226,17 +225,12 @@ def doubts_of(
     return said
 
 
-@dataclass(frozen=True)
-class Elsewhere:
-    """Another series of measurements: rows that place the arm anew, and rows that judge; `arm` has nominal links."""
+def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> tuple[SerialArm, Rows, Rows] | None:
+    """The records of `transfer`, split as the others are; None where there are none.
 
-    arm: SerialArm
-    train: Rows
-    test: Rows
-
-
-def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | None:
-    """The records of `transfer`, split as the others are; None where there are none."""
+    Returns:
+        The arm with nominal links, rows that place it anew, and rows that judge.
+    """
     if config.transfer is None:
         return None
     if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:
@@ -250,20 +244,20 @@ def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | 
         )
     records, arm = read_records(config, config.transfer, mechanism)
     assert isinstance(arm, SerialArm)
-    return Elsewhere(arm, *rows_of_split(records, split_records(config, records)))
+    return arm, *rows_of_split(records, split_records(config, records))
 
 
-def transferred(config: IdentifyConfig, elsewhere: Elsewhere, values: Tensor) -> dict[str, Any]:
+def transferred(config: IdentifyConfig, own: SerialArm, train: Rows, test: Rows, values: Tensor) -> dict[str, Any]:
     """The block `transfer` of identified.json: pose errors with nominal and with identified links.
 
     Args:
+        own, train, test: as of `read_elsewhere`.
         values: identified parameters, `k` [SI]; the frames are fitted anew to either.
     """
-    train, test = elsewhere.train, elsewhere.test
     errors = []
     # What joints give under torques is no part of an arm.
-    for nominal in (elsewhere.arm.nominal, values[: len(elsewhere.arm.nominal)]):
-        arm = elsewhere.arm.with_nominal(nominal)
+    for nominal in (own.nominal, values[: len(own.nominal)]):
+        arm = own.with_nominal(nominal)
         assert isinstance(arm, SerialArm)
         placed = fit_frames(arm, train.joints[0], train.observed[0], rotation_weight=config.rotation_weight)
         errors.append(arm.pose_error(arm.forward_kinematics(test.joints, placed), test.observed))

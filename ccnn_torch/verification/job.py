@@ -284,8 +284,8 @@ def verify_model(
     compensated: bool = False,
     refit_frames: bool = False,
     **how: Any,
-) -> Verified:
-    """Judge a model on new rows.
+) -> tuple[VerifyResults, RunArrays]:
+    """Judge a model on new rows; also gives the arrays that its pictures need, all rows held out.
 
     Without `compensated` the joints are commands and the pose is what the uncompensated machine reached: before = its
     distance from the nominal machine's pose, after = from the pose that the model predicts, as `pose` of a run's
@@ -353,7 +353,7 @@ def verify_model(
     results.text = verify_text(results)
     if loaded.data_hash == model.facts.get("data_sha256"):
         results.text = f"These are the rows that the model was made from, so this is no test. {results.text}"
-    return Verified(results, figure_arrays(rows, measured, left, before, after))
+    return results, figure_arrays(rows, measured, left, before, after)
 
 
 def _moved(rows: Rows, results: VerifyResults) -> list[str]:
@@ -371,14 +371,6 @@ def _moved(rows: Rows, results: VerifyResults) -> list[str]:
         f"The measuring device seems to have moved since the model was made: a rigid motion of its frame by "
         f"{motion_text(motion)} would leave {1e3 * left:.3g} mm RMS; if it was moved, judge with --refit-frames."
     ]
-
-
-@dataclass(frozen=True)
-class Verified:
-    """What was found, and the arrays that its pictures need, all rows held out."""
-
-    results: VerifyResults
-    arrays: RunArrays
 
 
 def error_of(unit: Length, before: Tensor | None, after: Tensor | None, promise: Promised | None) -> Error | None:
