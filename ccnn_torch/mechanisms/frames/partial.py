@@ -104,16 +104,6 @@ class Seen(Around, ABC):
         """Of the mechanism, `count x n` [SI]."""
         return self.mechanism.sample_joints(count, generator)
 
-    def singular_values(
-        self,
-        joints: Tensor,
-        rotation_weight: float = 0.04,
-        parameters: Tensor | None = None,
-        guess: Tensor | None = None,
-    ) -> Tensor:
-        """See `Mechanism.singular_values`; as many as there are readings."""
-        return super().singular_values(joints, rotation_weight, parameters, guess)[..., : self.compared]
-
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """All that is finite: what is not seen may be anything; `...`, bool."""
         return torch.isfinite(pose).all(-1).expand(leading_shape(pose, self.resolve(parameters)))
