@@ -127,7 +127,7 @@ def verify(
         InputError: the model or the rows cannot be used; the sentence says what to change.
     """
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
-    return verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code=allow_code).results
+    return verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code=allow_code)[0]
 
 
 def since(

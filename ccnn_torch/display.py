@@ -78,6 +78,14 @@ def number_text(value: float | None, digits: int = 4) -> str:
     return f"{value:.{digits - 1}e}"
 
 
+def with_unit(value: float | None, unit: str, digits: int = 3, like: float | None = None) -> str:
+    """A number [unit] with the prefixed unit that fits it, or that fits a number `like` it; `–` for None."""
+    if value is None:
+        return "–"
+    scale, shown = display_unit(unit, value if like is None else like)
+    return f"{number_text(value / scale, digits)} {shown}"
+
+
 def count_text(count: int, word: str) -> str:
     """`1 repeat`, `30 repeats`."""
     return f"{count} {word}" if count == 1 else f"{count} {word}{'es' if word.endswith('ch') else 's'}"

@@ -1,9 +1,10 @@
-"""The name that a misspelt one most likely means."""
+"""The name that a misspelt one most likely means, and the names that a pattern fits."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
 
 
 def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | None:
@@ -17,6 +18,11 @@ def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | 
     folded = {candidate.lower(): candidate for candidate in reversed(candidates)}
     near = difflib.get_close_matches(name.lower(), folded, 1, cutoff)
     return folded[near[0]] if near else None
+
+
+def matching(names: Iterable[str], patterns: Sequence[str]) -> list[str]:
+    """The names that one of the patterns (`load_*`) fits, in their order."""
+    return [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 
 def hint(name: str, candidates: Sequence[str], otherwise: str = "there are", more: str = "") -> str:

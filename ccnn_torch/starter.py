@@ -27,6 +27,7 @@ from ccnn_torch.records.formats import form_of
 from ccnn_torch.records.headers import EULER_ANGLES
 from ccnn_torch.records.load import load_records, read_source
 from ccnn_torch.records.table import Table
+from ccnn_torch.spelling import matching
 from ccnn_torch.units import si_unit_of, to_si
 
 _JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta)0*(\d+)")
@@ -204,13 +205,6 @@ def unit_pair(text: str) -> dict[str, str]:
 def is_unit(text: str) -> bool:
     """Whether a unit is there and known."""
     return bool(text) and _kind(text) is not None
-
-
-def is_covariate(name: str, patterns: Sequence[str] = DEFAULT_COVARIATES) -> bool:
-    """Whether a run takes a column of this name as an input by default."""
-    from fnmatch import fnmatchcase
-
-    return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 def choose_split(positions: np.ndarray[tuple[int, int], np.dtype[np.float64]] | None, names: Sequence[str],
@@ -438,7 +432,7 @@ def _column_lines(columns: dict[str, str], found: Recognised, table: Table, why:
     """
     targets = {**columns, **found.inputs}
     needed = {table.header(name): target for name, target in targets.items() if table.header(name) != target}
-    bare = [name for name in found.unknown if is_covariate(name) and not table.units[name]]
+    bare = [name for name in matching(found.unknown, DEFAULT_COVARIATES) if not table.units[name]]
     lines = [f"# Orientation: {text}." for name, text in _ORIENTATION.items() if name in found.pose]
     if why:
         lines = [
@@ -474,9 +468,9 @@ def _count_lines(
 
 
 def _other_lines(found: Recognised, table: Table) -> list[str]:
-    inputs = [name for name in found.unknown if is_covariate(name) and table.units[name]]
+    inputs = [name for name in matching(found.unknown, DEFAULT_COVARIATES) if table.units[name]]
     inputs += [target.partition("[")[0] for target in found.inputs.values()]
-    ignored = [name for name in found.unknown if not is_covariate(name)]
+    ignored = [name for name in found.unknown if not matching([name], DEFAULT_COVARIATES)]
     lines = [f"# Inputs beside the joints, by their names: {', '.join(inputs)}."] if inputs else []
     if ignored:
         lines.append(f"# Not used: {', '.join(ignored)}. `covariates: [NAME]` makes one an input.")

@@ -135,7 +135,7 @@ def test_from_new_to_commands_in_the_count_of_the_controller(
     for file in (tmp_path / "i" / "identified.yaml", tmp_path / "r" / "model.onnx"):
         model = load_compensation(file)
         assert model.joint_map == {"q3": "J3 - J2"}
-        assert verify_model(model, rows).results["position"]["after"]["rms"] < 1e-4
+        assert verify_model(model, rows)[0]["position"]["after"]["rms"] < 1e-4
         found = model(joints)
         out, again = tmp_path / "out.csv", tmp_path / "again.csv"
         assert cli("compensate", file, rows, out)[0] == 0

@@ -244,7 +244,7 @@ def test_covariates_can_be_chosen_or_left_out() -> None:
     assert prepared("arm", covariates=[]).dataset.inputs.shape[-1] == 6
     chosen = prepared("arm", covariates=["load_*", "time"])
     assert [(c.name, c.unit) for c in chosen.covariate_coordinates][:2] == [("time", "s"), ("load_x", "N")]
-    with pytest.raises(InputError, match="'humidity' is no column of the arm with the cause mixed; it has time"):
+    with pytest.raises(InputError, match="there is no column 'humidity'; the arm with the cause mixed has time"):
         prepared("arm", covariates=["humidity"])
 
 

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.display import count_text, display_unit, number_text, typed_path
+from ccnn_torch.display import count_text, display_unit, number_text, typed_path, with_unit
 from ccnn_torch.files.write import write_rows, write_whole
 from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.report.page import Answer, InlineFigure, Page, sections_of
@@ -60,9 +60,8 @@ def _answers(results: RunResults, folder: Path | None) -> list[Answer]:
         steps = [("as it is", position.before), *((part, position[part]) for part in results.pose.parts)]
         parts = []
         for name, block in [*steps, (best, position.after)]:
-            scale, unit = display_unit("m", block.rms.median or 0.0)
-            size = number_text(None if block.rms.median is None else block.rms.median / scale, 3)
-            parts.append(f"{size} {unit} {name}" if name == "as it is" else f"with {name} {size} {unit}")
+            size = with_unit(block.rms.median, "m")
+            parts.append(f"{size} {name}" if name == "as it is" else f"with {name} {size}")
         told.append(Answer("Step by step", f"{', '.join(parts)} (RMS position error on held-out rows)."))
     if folder is not None and results.records is not None:
         path = typed_path(str(folder))

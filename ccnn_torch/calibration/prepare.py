@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 import torch
@@ -33,6 +32,7 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, load_mechan
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
+from ccnn_torch.records.covariates import asked_columns
 from ccnn_torch.records.load import fewest_rows
 from ccnn_torch.records.splits import Column, Split
 from ccnn_torch.simulation.case_study import Simulation, build_case
@@ -135,31 +135,14 @@ def prepare(config: RunConfig, given: Given | None = None) -> Prepared:
 def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
     assert config.case is not None
     case = build_case(config.case, config.variant or "printed", config.order or "raster")
-    mechanism = case.mechanism
-    doubts = check_memory(config, len(case.time), len(mechanism.joints))
-    chosen = _choose([Coordinate("t", "1")], config.covariates or [], f"case {config.case}")
-    covariates = case.time[:, None] if chosen else case.joints[:, :0]
-    noise = case.noise(seeds)
-    pose = case.measured(noise)
-    deviations = joint_deviations(mechanism, case.joints, pose, **_pseudoerror_settings(config, mechanism))
-    splits = _splits(config, mechanism.frame(case.pose)[0], {"t": case.time}, seeds)
-    notes = [*doubts, *deviations.notes()]
+    doubts = check_memory(config, len(case.time), len(case.mechanism.joints))
+    time, noise = {Coordinate("t", "1"): case.time}, case.noise(seeds)
+    chosen = asked_columns(["t"], config.covariates or [], f"the case {config.case} has")
+    prepared = _simulated(config, case.mechanism, case.joints, case.pose, case.measured(noise), time, chosen, seeds)
+    notes = [*doubts, *prepared.notes]
     if config.covariates is None:
         notes.append("The time t is not given to the learner; covariates=[t] adds it.")
-    return Prepared(
-        mechanism=mechanism,
-        parameters=None,
-        joints=by_repeat(case.joints, seeds),
-        covariates=by_repeat(covariates, seeds),
-        covariate_coordinates=tuple(chosen),
-        pose=pose,
-        pseudoerror=deviations,
-        total=by_repeat(deviations.deviation, seeds),
-        dataset=dataset_of(mechanism, case.joints, covariates, deviations, splits, seeds),
-        data_hash=_hash(case.joints, covariates, pose),
-        simulation=case.simulated(noise),
-        notes=notes,
-    )
+    return replace(prepared, simulation=case.simulated(noise), notes=notes)
 
 
 def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
@@ -169,43 +152,62 @@ def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
     doubts = check_memory(config, about.rows, _MOST_JOINTS)
     machine = build_machine(about.machine, about.cause, about.strength, about.rows, about.noise, seeds)
     mechanism, joints = machine.mechanism, machine.joints
-    chosen = _choose(list(machine.columns), config.covariates, f"{about.machine} with the cause {about.cause}")
-    covariates = torch.stack([machine.columns[c] for c in chosen], -1) if chosen else joints[..., :0]
-
-    def solved(pose: Tensor) -> Pseudoerror:
-        return joint_deviations(mechanism, joints, pose, **_pseudoerror_settings(config, mechanism))
-
-    deviations = solved(machine.measured)
-    splits = [
-        _splits(config, positions, {c.name: values[k] for c, values in machine.columns.items()}, [seed])[0]
-        for k, (seed, positions) in enumerate(zip(seeds, mechanism.frame(machine.pose)[0], strict=True))
-    ]
+    whose = f"the {about.machine} with the cause {about.cause} has"
+    chosen = asked_columns([c.name for c in machine.columns], config.covariates, whose)
     jacobian = mechanism.jacobian(joints, guess=machine.measured)
+    rows = (mechanism, joints, machine.pose, machine.measured, machine.columns, chosen, seeds)
+    prepared = _simulated(config, *rows, jacobian, machine.turns_far)
+
+    def deviation(pose: Tensor) -> Tensor:
+        return joint_deviations(mechanism, joints, pose, **_pseudoerror_settings(config, mechanism)).deviation
+
+    simulation = simulate_realistic(machine, deviation, prepared.total)
+    return replace(prepared, simulation=simulation, notes=[*doubts, *prepared.notes])
+
+
+def _simulated(
+    config: RunConfig,
+    mechanism: Mechanism,
+    joints: Tensor,
+    pose: Tensor,
+    measured: Tensor,
+    columns: Mapping[Coordinate, Tensor],
+    names: list[str],
+    seeds: list[int],
+    jacobian: Tensor | None = None,
+    turns_far: Tensor | None = None,
+) -> Prepared:
+    """The rows of a simulated machine.
+
+    Args:
+        joints: commanded, `[r x] s x n` [SI].
+        pose: without errors, `[r x] s x p` [SI]: by their place rows are held out.
+        measured: `r x s x p` [SI].
+        columns: what else is recorded, `[r x] s` each [SI].
+        names: those that are inputs.
+        jacobian, turns_far: as of `dataset_of`.
+    """
+    chosen = tuple(c for c in columns if c.name in names)
+    covariates = torch.stack([columns[c] for c in chosen], -1) if chosen else joints[..., :0]
+    deviations = joint_deviations(mechanism, joints, measured, **_pseudoerror_settings(config, mechanism))
+    known = {c.name: values.expand(measured.shape[:-1]) for c, values in columns.items()}
+    splits = [
+        _splits(config, positions, {name: values[k] for name, values in known.items()}, [seed])[0]
+        for k, (seed, positions) in enumerate(zip(seeds, by_repeat(mechanism.frame(pose)[0], seeds), strict=True))
+    ]
     return Prepared(
         mechanism=mechanism,
         parameters=None,
-        joints=joints,
-        covariates=covariates,
-        covariate_coordinates=tuple(chosen),
-        pose=machine.measured,
+        joints=by_repeat(joints, seeds),
+        covariates=by_repeat(covariates, seeds),
+        covariate_coordinates=chosen,
+        pose=measured,
         pseudoerror=deviations,
-        total=deviations.deviation,
-        dataset=dataset_of(mechanism, joints, covariates, deviations, splits, seeds, jacobian, machine.turns_far),
-        data_hash=_hash(joints, covariates, machine.measured),
-        simulation=simulate_realistic(machine, lambda pose: solved(pose).deviation, deviations.deviation),
-        notes=[*doubts, *deviations.notes()],
+        total=by_repeat(deviations.deviation, seeds),
+        dataset=dataset_of(mechanism, joints, covariates, deviations, splits, seeds, jacobian, turns_far),
+        data_hash=_hash(joints, covariates, measured),
+        notes=deviations.notes(),
     )
-
-
-def _choose(there: list[Coordinate], wanted: list[str] | None, what: str) -> list[Coordinate]:
-    """The columns that names or patterns ask for, in the order recorded; all of them where nothing is asked."""
-    if wanted is None:
-        return there
-    for pattern in wanted:
-        if not any(fnmatchcase(coordinate.name, pattern) for coordinate in there):
-            known = ", ".join(coordinate.name for coordinate in there) or "no covariates"
-            raise InputError(f"covariates: {pattern!r} is no column of the {what}; it has {known}")
-    return [coordinate for coordinate in there if any(fnmatchcase(coordinate.name, p) for p in wanted)]
 
 
 def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> Prepared:

@@ -308,9 +308,8 @@ def verify(
         loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
         how = {name: getattr(wanted, name) for name in ("columns", "joint_map", "mechanism_keys")}
         how["allow_code"] = allow_code
-        found = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, **how)
-        write_verify_report(out, found.results, found.arrays)
-    results = found.results
+        results, arrays = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, **how)
+        write_verify_report(out, results, arrays)
     if not quiet:
         typer.echo(results.text)
         for note in results.notes:

@@ -1,10 +1,6 @@
 """Geometric parameters of a machine from measured records."""
 
-from ccnn_torch.identification.identifiability import (
-    Knowledge as Knowledge,
-    require_identifiable as require_identifiable,
-    what_is_known as what_is_known,
-)
+from ccnn_torch.identification.identifiability import Knowledge as Knowledge, what_is_known as what_is_known
 from ccnn_torch.identification.problems.parameters import (
     ParameterChoice as ParameterChoice,
     Selection as Selection,

@@ -10,11 +10,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.linalg import qr
 from scipy.sparse.csgraph import connected_components
-from scipy.special import ndtri, stdtrit
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
-from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.problem import OPEN, Problem, WeightedRows
 
 # Component of a hidden direction below which a parameter does not take part. Real geometry is never exactly parallel:
@@ -96,9 +94,7 @@ class Knowledge:
         identifiable: `r x k`, bool: whether the rows alone determine the parameter, without the priors.
         singular_values: of the Jacobian with residuals in their unit and parameters in plausible errors, falling,
             without priors, `r x k` [1].
-        directions: its right singular vectors, one a row, `r x k x k`, in plausible errors; those from `rank` on
-            cannot be known.
-        rank: `r`.
+        rank: how many directions the rows see, `r`.
         combinations: sentences that say what of the parameters left open is known, of the machine of least rank; empty
             where every parameter is identifiable.
         noise: standard deviation of the residuals that the fit leaves, `r`, in their unit: about 1 where the noise was
@@ -111,21 +107,11 @@ class Knowledge:
     sd: Tensor
     identifiable: Tensor
     singular_values: Tensor
-    directions: Tensor
     rank: Tensor
     combinations: tuple[str, ...]
     noise: Tensor
     freedom: Tensor
     noise_known: bool
-
-    def half_width(self, level: float = 0.95) -> Tensor:
-        """Half the interval that holds the truth with this probability, `r x k` [SI]; by Student's t where the noise
-        is that of the fit."""
-        tail = (1 + level) / 2
-        if self.noise_known:
-            return self.sd * float(ndtri(tail))
-        factor = stdtrit(self.freedom.clamp_min(1e-9).cpu().numpy(), tail)
-        return self.sd * torch.as_tensor(factor, dtype=self.sd.dtype, device=self.sd.device)[:, None]
 
 
 def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
@@ -171,7 +157,6 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
         sd=torch.where(left_open, torch.inf, ((unit[:, None] * root).square() + dragged).sqrt() * problem.scale),
         identifiable=identifiable,
         singular_values=singular,
-        directions=directions,
         rank=seen.sum(-1),
         combinations=combinations_in_words(problem.parameters, hidden[worst], problem.scale),
         noise=noise,
@@ -191,20 +176,6 @@ def _noise(
     freedom = torch.where(freedom > 1e-6, freedom, 0.0)
     noise = torch.where(freedom > 0, (residual.square().sum(-1) / freedom.clamp_min(1e-6)).sqrt(), torch.inf)
     return freedom, noise
-
-
-def require_identifiable(knowledge: Knowledge) -> None:
-    """Refuse rows that leave a parameter open, for what needs every one.
-
-    Raises:
-        InputError: the identification matrix is singular; the sentence names the parameters that are determined.
-    """
-    if knowledge.combinations:
-        k = len(knowledge.parameters)
-        raise InputError(
-            f"the identification matrix is singular (rank {int(knowledge.rank.min())} of {k}): "
-            f"{'; '.join(knowledge.combinations)}; fix or tie parameters, give a prior, or measure other poses"
-        )
 
 
 def _tall(matrix: Tensor) -> Tensor:

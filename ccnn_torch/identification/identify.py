@@ -150,7 +150,7 @@ def identify(
     results, arrays, outcomes = _judged(config, measured, outcomes)
     results["counts"] = count_study(config, mechanism)
     if elsewhere is not None:
-        results["transfer"] = transferred(config, elsewhere, judged_first)
+        results["transfer"] = transferred(config, *elsewhere, judged_first)
     return Identification(config, measured, outcomes, results, arrays, given)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from ccnn_torch.display import display_unit, number_text
+from ccnn_torch.display import number_text, with_unit
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.measured import Measured, Rows, read_records, rows_of_split, split_records
@@ -215,8 +214,8 @@ def doubts_of(
         return said
     if noise is not None and after > _ABOVE_NOISE * noise:
         said.append(
-            f"The held-out position error is still {after / noise:.3g} times the noise ({_length(after)}, "
-            f"{_length(noise)}): something else is wrong beside the geometry that was identified."
+            f"The held-out position error is still {after / noise:.3g} times the noise ({with_unit(after, 'm')}, "
+            f"{with_unit(noise, 'm')}): something else is wrong beside the geometry that was identified."
         )
     if before > 0 and after > _LITTLE_GAINED * before:
         said.append(
@@ -226,22 +225,12 @@ def doubts_of(
     return said
 
 
-def _length(value: float) -> str:
-    scale, unit = display_unit("m", value)
-    return f"{number_text(value / scale, 3)} {unit}"
+def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> tuple[SerialArm, Rows, Rows] | None:
+    """The records of `transfer`, split as the others are; None where there are none.
 
-
-@dataclass(frozen=True)
-class Elsewhere:
-    """Another series of measurements: rows that place the arm anew, and rows that judge; `arm` has nominal links."""
-
-    arm: SerialArm
-    train: Rows
-    test: Rows
-
-
-def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | None:
-    """The records of `transfer`, split as the others are; None where there are none."""
+    Returns:
+        The arm with nominal links, rows that place it anew, and rows that judge.
+    """
     if config.transfer is None:
         return None
     if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:
@@ -255,20 +244,20 @@ def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | 
         )
     records, arm = read_records(config, config.transfer, mechanism)
     assert isinstance(arm, SerialArm)
-    return Elsewhere(arm, *rows_of_split(records, split_records(config, records)))
+    return arm, *rows_of_split(records, split_records(config, records))
 
 
-def transferred(config: IdentifyConfig, elsewhere: Elsewhere, values: Tensor) -> dict[str, Any]:
+def transferred(config: IdentifyConfig, own: SerialArm, train: Rows, test: Rows, values: Tensor) -> dict[str, Any]:
     """The block `transfer` of identified.json: pose errors with nominal and with identified links.
 
     Args:
+        own, train, test: as of `read_elsewhere`.
         values: identified parameters, `k` [SI]; the frames are fitted anew to either.
     """
-    train, test = elsewhere.train, elsewhere.test
     errors = []
     # What joints give under torques is no part of an arm.
-    for nominal in (elsewhere.arm.nominal, values[: len(elsewhere.arm.nominal)]):
-        arm = elsewhere.arm.with_nominal(nominal)
+    for nominal in (own.nominal, values[: len(own.nominal)]):
+        arm = own.with_nominal(nominal)
         assert isinstance(arm, SerialArm)
         placed = fit_frames(arm, train.joints[0], train.observed[0], rotation_weight=config.rotation_weight)
         errors.append(arm.pose_error(arm.forward_kinematics(test.joints, placed), test.observed))

@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any
 
 from ccnn_torch.compensation.targets.machines import klipper_numbers
-from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter
+from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter, with_unit
 from ccnn_torch.files.write import write_rows
 from ccnn_torch.identification.judge import figure_text
 from ccnn_torch.records.formats.klipper import STEPPERS
@@ -78,17 +78,15 @@ def constraint_table(results: Mapping[str, Any]) -> Table | None:
         return None
     rows = []
     for name, block in about["unknowns"].items():
-        scale, unit = display_unit(block["unit"], block["sd"] or 1.0)
-        sd = "not identifiable" if block["sd"] is None else f"{number_text(block['sd'] / scale, 3)} {unit}"
+        sd = "not identifiable" if block["sd"] is None else with_unit(block["sd"], block["unit"])
         rows.append(
             (name, f"{number_text(block['value'], 6)} {block['unit']}".removesuffix(" 1"), sd.removesuffix(" 1"))
         )
     count = sum(place["rows"] for place in about["placements"])
-    scale, unit = display_unit(about.get("unit", "m"), about["noise"])
     source = "as given" if about["noise_known"] else "from the residuals"
     note = (
         f"{count} rows in {len(about['placements'])} groups; standard deviation of one equation "
-        f"{number_text(about['noise'] / scale, 3)} {unit}, {source}. "
+        f"{with_unit(about['noise'], about.get('unit', 'm'))}, {source}. "
         "Turns count from where the nominal machine sees them."
     )
     if not rows and about.get("readings"):
@@ -112,8 +110,9 @@ def identified_verdict(results: Block) -> str:
     failed = not_settled(results)
     parts = []
     for name, block in named:
-        mean = f" (mean {_with_unit(block, 'mean_after')})" if "constraint" in results and "mean_after" in block else ""
-        parts.append(f"{name} {_with_unit(block, 'before')} → {_with_unit(block, 'after')} RMS{mean}")
+        before, after, mean = (with_unit(block.get(key), block["unit"]) for key in ("before", "after", "mean_after"))
+        mean = f" (mean {mean})" if "constraint" in results and "mean_after" in block else ""
+        parts.append(f"{name} {before} → {after} RMS{mean}")
     rows = count_text(results["rows"]["test"], "held-out pose")
     machines = f" of {results['machines']} machines" if results["machines"] > 1 else ""
     if "constraint" in results:
@@ -224,13 +223,6 @@ def _together(results: Block) -> list[Section]:
     return [Section("Values that move together", sentences=[f"{text}." for text in found])] if found else []
 
 
-def _with_unit(block: Block, key: str) -> str:
-    if block[key] is None:
-        return "unknown"
-    scale, unit = display_unit(block["unit"], block[key])
-    return f"{number_text(block[key] / scale, 3)} {unit}"
-
-
 def _shown_units(blocks: Sequence[Block]) -> dict[str, tuple[float, str]]:
     """For each SI unit the one that all its parameters are shown in: that of the usual size, or a larger one where a
     number would have more than five digits before the point."""
@@ -313,8 +305,7 @@ def _method_table(results: Block) -> Table:
     if "constraint" in results:
         note = f"RMS distance of held-out rows from where {holder(results)} the tool. {BEFORE_SAYS}"
     if noise.get("noise") is not None:
-        scale, unit = display_unit("m", noise["noise"])
-        note += f" The measurement noise alone is {number_text(noise['noise'] / scale, 3)} {unit} in position."
+        note += f" The measurement noise alone is {with_unit(noise['noise'], 'm')} in position."
     return table_of("Held-out pose error", columns, note, details)
 
 

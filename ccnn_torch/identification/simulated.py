@@ -6,8 +6,7 @@ to command, and what the encoders then say. A serial arm is given joints and tak
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,29 +36,14 @@ def normal_draws(shape: Sequence[int], seeds: Sequence[int], *stream: int) -> Te
     return torch.stack(draws)
 
 
-@dataclass(frozen=True)
-class Instrument:
-    """What is measured of a machine.
-
-    Attributes:
-        view: the mechanism with what is measured as its pose, `o` coordinates.
-        observe: (pose `... x p`, position `... x 3`, rotation `... x 3 x 3` or None) of the platform -> `... x o`.
-        pose_of: `... x o` -> the pose that was measured, `... x p`.
-    """
-
-    view: Mechanism
-    observe: Callable[[Tensor, Tensor, Tensor | None], Tensor]
-    pose_of: Callable[[Tensor], Tensor]
-
-
-def make_instrument(mechanism: Mechanism, points: Sequence[tuple[Size, Size, Size]] | None) -> Instrument:
-    """The pose itself, or three points on the platform.
+def seen_by(mechanism: Mechanism, points: Sequence[tuple[Size, Size, Size]] | None) -> Mechanism:
+    """The mechanism with what is measured as its pose: itself, or three points on the platform.
 
     Raises:
         InputError: points lie on one line, or the mechanism's inverse kinematics takes no measured frame.
     """
     if points is None:
-        return Instrument(mechanism, lambda pose, position, rotation: pose, lambda observed: observed)
+        return mechanism
     place = torch.tensor([[size(v, "m", "simulate.points") for v in p] for p in points], dtype=torch.float64)
     if float(torch.linalg.cross(place[0] - place[1], place[2] - place[1]).norm()) < 1e-9:
         raise InputError("simulate.points: the three points lie on one line, which shows no rotation about it")
@@ -67,8 +51,7 @@ def make_instrument(mechanism: Mechanism, points: Sequence[tuple[Size, Size, Siz
         raise InputError(
             f"simulate.points: {mechanism.name} takes no measured rotation matrix; measure its pose (remove points)"
         )
-    view = PointsView(mechanism, place)
-    return Instrument(view, lambda pose, *frame: view.seen(*frame), view.pose_of)
+    return PointsView(mechanism, place)
 
 
 class PointsView(Mechanism):
@@ -258,7 +241,7 @@ def choose_places(config: IdentifyConfig, places: Places, count: int, seeds: Seq
 def plan_places(
     config: IdentifyConfig,
     places: Places,
-    instrument: Instrument,
+    view: Mechanism,
     count: int,
     pose_noise: Tensor,
     joint_noise: Tensor | None,
@@ -274,12 +257,12 @@ def plan_places(
     # The most informative poses of all are next to singular ones, where noise is no longer small.
     regular = mechanism.condition_number(joints, guess=pose) <= MAX_CONDITION
     candidates, joints, pose = candidates[regular], joints[regular], pose[regular]
-    position, rotation = mechanism.frame(pose)
-    rows = Rows(joints[None], instrument.observe(pose, position, rotation)[None])
+    observed = view.seen(*mechanism.frame(pose)) if isinstance(view, PointsView) else pose
+    rows = Rows(joints[None], observed[None])
     nominal = Measured(
         mechanism=mechanism,
         kinematics=Kinematics(mechanism),
-        view=instrument.view,
+        view=view,
         rows=rows,
         test=rows,
         start=mechanism.nominal[None],
@@ -314,23 +297,24 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
     assert about is not None
     seeds = [config.seed + k for k in range(about.machines)]
     truth = mechanism.nominal + _errors(mechanism, about, seeds)
-    instrument = make_instrument(mechanism, about.points)
-    noise = sizes_of_pose(about.noise, instrument.view.pose, "simulate.noise")
+    view = seen_by(mechanism, about.points)
+    noise = sizes_of_pose(about.noise, view.pose, "simulate.noise")
     joint_sd = sizes_of_joints(about.joint_noise, mechanism.joints, "simulate.joint_noise")
     joint_noise = joint_sd if bool((joint_sd > 0).any()) else None
     places = Places(mechanism, truth, about.box, about.circle)
     count = about.poses if poses is None else poses
     of_legs: dict[int, Tensor] = {}
     if about.design.startswith("planned"):
-        common, of_legs = plan_places(config, places, instrument, count, noise, joint_noise)
+        common, of_legs = plan_places(config, places, view, count, noise, joint_noise)
     else:
         common = choose_places(config, places, count, seeds, _PLACES)
 
     kinematics = make_kinematics(mechanism, about.as_built)
 
     def measure(joints: Tensor, pose: Tensor, stream: int) -> Rows:
-        frame = kinematics.frame(joints, truth[:, None], pose) if about.points else (pose, None)
-        observed = instrument.observe(pose, *frame)
+        observed = pose
+        if isinstance(view, PointsView):
+            observed = view.seen(*kinematics.frame(joints, truth[:, None], pose))
         return Rows(
             joints + joint_sd * normal_draws(joints.shape[1:], seeds, stream, 1),
             observed + noise * normal_draws(observed.shape[1:], seeds, stream, 0),
@@ -339,13 +323,15 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
     test = places.random(about.test_poses, generator_of(config.seed, _TEST, 2))
     wanted_joints, wanted = places.taken(test)
     held_out = measure(wanted_joints, wanted, _TEST)
+    if isinstance(view, PointsView):
+        held_out = Rows(held_out.joints, view.pose_of(held_out.observed))
     return Measured(
         mechanism=mechanism,
         kinematics=kinematics,
-        view=instrument.view,
+        view=view,
         rows=measure(*places.taken(common), _ROWS),
         leg_rows={leg: measure(*places.taken(place), _LEGS + leg) for leg, place in of_legs.items()},
-        test=Rows(held_out.joints, instrument.pose_of(held_out.observed)),
+        test=held_out,
         start=mechanism.nominal.expand(len(seeds), -1).clone(),
         truth=truth,
         wanted=wanted,

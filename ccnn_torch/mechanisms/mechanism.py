@@ -368,12 +368,13 @@ class Mechanism(nn.Module):
         held; Gosselin and Angeles 1990).
 
         Returns:
-            `... x n` (or fewer, as many as the Jacobian has rows); NaN where the joints have no pose.
+            `... x n` (or fewer, as many as the pose has coordinates that are measured); NaN where the joints have no
+            pose.
         """
         jacobian = self.jacobian(joints, parameters, guess) * self.channel_weights(rotation_weight)[:, None]
         known = torch.isfinite(jacobian).all(-1).all(-1)[..., None]
         values = torch.linalg.svdvals(torch.where(known[..., None], jacobian, torch.zeros_like(jacobian)))
-        return torch.where(known, values, torch.nan)
+        return torch.where(known, values, torch.nan)[..., : self.compared]
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Which poses `... x p` have joints on the nominal branch; `...`, bool."""

@@ -12,8 +12,6 @@ from ccnn_torch.numerics.least_squares import Solution, jacobian_of, levenberg_m
 
 # Residual left [SI] above which a settled search is a least-squares minimum and not a root.
 _ROOT = 1e-9
-# Damping of a search whose solutions may be more than one [1].
-_DAMPING = 1e-8
 
 
 def solve(
@@ -63,39 +61,6 @@ def carry_derivative(x: Tensor, slope: Tensor, residual: Tensor) -> Tensor:
     """
     step = _least_norm_solve(slope.detach(), residual)
     return x.detach() - (step - step.detach())
-
-
-def nearest(
-    gap: Callable[..., Tensor],
-    slope: Callable[..., Tensor],
-    anchor: Tensor,
-    data: tuple[Tensor, ...],
-    damping: float,
-    redundant: bool,
-) -> Tensor:
-    """Joints of the least gap by damped Newton from `anchor`, `... x n`; no gradient flows through it.
-
-    Args:
-        gap: `(joints, *data)` -> `... x c` [m].
-        slope: `(joints, *data)` -> `... x c x n`, its derivative by the joints.
-        anchor: `... x n` [SI], without gradient.
-        data: what the gap needs besides joints, `... x d` each.
-        damping: weight of the distance from the anchor beside the gap [m per joint unit].
-        redundant: whether many joints have the same gap: then the nearest to the anchor, unless damped.
-    """
-    ridge = damping * torch.eye(anchor.shape[-1], dtype=anchor.dtype)
-
-    def residual(q: Tensor, start: Tensor, *rest: Tensor) -> Tensor:
-        left = gap(q, *rest)
-        return torch.cat([left, damping * (q - start)], dim=-1) if damping else left
-
-    def slopes(q: Tensor, start: Tensor, *rest: Tensor) -> Tensor:
-        rows = slope(q, *rest)
-        return torch.cat([rows, ridge.expand(*q.shape[:-1], -1, -1)], dim=-2) if damping else rows
-
-    plain = (anchor, *(d.detach() for d in data))
-    found = levenberg_marquardt(residual, anchor, slopes, plain, tolerance=1e-10, damping=_DAMPING)
-    return least_norm(residual, slopes, found, anchor, plain) if redundant and damping == 0 else found.value
 
 
 def least_norm(

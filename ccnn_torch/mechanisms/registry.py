@@ -6,10 +6,9 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.dh_file import read_dh_file, read_urdf
@@ -37,14 +36,6 @@ _POSES, _STEPS = 256, 8
 _LARGEST_STEP, _APART = 1.0, 0.1
 
 
-class Jump(NamedTuple):
-    """A pose `p` [SI], its joints straight from home, and its joints on a walk in small steps, `n` each [SI]."""
-
-    pose: Tensor
-    direct: Tensor
-    walked: Tensor
-
-
 def is_numeric(mechanism: Mechanism) -> bool:
     """Whether the mechanism's inverse kinematics are the numeric default, which needs a branch to start from."""
     return type(mechanism).solve_inverse is Mechanism.solve_inverse
@@ -63,25 +54,13 @@ def settle_home(mechanism: Mechanism) -> None:
 
 
 def jump_sentence(mechanism: Mechanism, seed: int = 0) -> str:
-    """What is wrong where `find_jump` finds a pose; empty where it finds none."""
-    jump = find_jump(mechanism, seed) if is_numeric(mechanism) else None
-    if jump is None:
-        return ""
-    where = ", ".join(f"{c.name} = {v:.4g} {c.unit}" for c, v in zip(mechanism.pose, jump.pose.tolist(), strict=True))
-    direct, walked = ([f"{v:.4g}" for v in joints.tolist()] for joints in (jump.direct, jump.walked))
-    return (
-        f"its numeric inverse kinematics leave the branch of home_joints: at {where} they give the joints "
-        f"{', '.join(direct)}, and {', '.join(walked)} when they go there in small steps; make low and high narrower, "
-        "put home_pose in their middle with its exact home_joints, or write solve_inverse"
-    )
-
-
-def find_jump(mechanism: Mechanism, seed: int = 0) -> Jump | None:
-    """The sampled pose at which the joints found straight from home differ most from those of a walk there, if any.
+    """What is wrong where numeric inverse kinematics straight from home end elsewhere than on a walk; empty if nothing.
 
     The walk goes along a straight line of pose coordinates, each step from the joints of the last. A line that leaves
     the workspace or comes near a singularity proves nothing and is left out.
     """
+    if not is_numeric(mechanism):
+        return ""
     poses = mechanism.sample_workspace(_POSES, torch.Generator().manual_seed(seed))
     direct = mechanism.solve_inverse(poses)
     walked = mechanism.home_joints.expand_as(direct)
@@ -93,7 +72,17 @@ def find_jump(mechanism: Mechanism, seed: int = 0) -> Jump | None:
         walked = there
     gap = torch.where(smooth, mechanism.wrap(direct - walked).abs().amax(-1), 0.0)
     worst = int(gap.argmax())
-    return Jump(poses[worst], direct[worst], walked[worst]) if float(gap[worst]) > _APART else None
+    if float(gap[worst]) <= _APART:
+        return ""
+    where = ", ".join(
+        f"{c.name} = {v:.4g} {c.unit}" for c, v in zip(mechanism.pose, poses[worst].tolist(), strict=True)
+    )
+    straight, stepped = (", ".join(f"{v:.4g}" for v in joints[worst].tolist()) for joints in (direct, walked))
+    return (
+        f"its numeric inverse kinematics leave the branch of home_joints: at {where} they give the joints {straight}, "
+        f"and {stepped} when they go there in small steps; make low and high narrower, put home_pose in their middle "
+        "with its exact home_joints, or write solve_inverse"
+    )
 
 
 # A root is settled to about 1e-12; a user's own closed form may close a little worse [m, rad].

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from scipy.linalg import qr
@@ -188,15 +187,9 @@ def _at(problem: Problem, data: tuple[Tensor, ...]) -> Callable[[Tensor], Tensor
     return lambda values: problem.residual(values, *data)
 
 
-class Seen(NamedTuple):
-    """The parameters that candidates determine when the others are fixed, by number, ascending `k'`, int64; and the
-    combinations that are not determined, in words."""
-
-    kept: Tensor
-    left_out: tuple[str, ...]
-
-
-def what_is_seen(rows: Tensor, prior: Tensor, parameters: Sequence[Parameter], scale: Tensor) -> Seen:
+def what_is_seen(
+    rows: Tensor, prior: Tensor, parameters: Sequence[Parameter], scale: Tensor
+) -> tuple[Tensor, tuple[str, ...]]:
     """Parameters enough to span all that the candidates show, and the combinations that show in none of them.
 
     Which parameter of such a combination is fixed does not matter to a plan: the determinants of all designs then
@@ -207,6 +200,10 @@ def what_is_seen(rows: Tensor, prior: Tensor, parameters: Sequence[Parameter], s
         prior: square roots of the prior's information, `k` [1], 0 where there is none.
         parameters: the `k`.
         scale: plausible errors, `k` [SI].
+
+    Returns:
+        The parameters that candidates determine when the others are fixed, by number, ascending `k'`, int64; and the
+        combinations that are not determined, in words.
 
     Raises:
         InputError: no candidate shows any of them.
@@ -219,9 +216,9 @@ def what_is_seen(rows: Tensor, prior: Tensor, parameters: Sequence[Parameter], s
         names = ", ".join(p.name for p in parameters)
         raise InputError(f"no pose shows any of the parameters {names}; free others, or give them a prior")
     if rank == len(parameters):
-        return Seen(torch.arange(rank), ())
+        return torch.arange(rank), ()
     kept = sorted(qr(factor.numpy(), mode="r", pivoting=True)[1][:rank].tolist())
-    return Seen(torch.tensor(kept), combinations_in_words(parameters, directions[~seen], scale))
+    return torch.tensor(kept), combinations_in_words(parameters, directions[~seen], scale)
 
 
 def _factor(rows: Tensor, prior: Tensor) -> Tensor:

@@ -133,9 +133,9 @@ def choose_poses(
     report = progress or (lambda _: None)
     rows = identification_rows(problem, _share(report, 0.0, 0.15))
     held = torch.where(torch.isfinite(problem.prior_sd), problem.scale / problem.prior_sd, 0.0)
-    seen = what_is_seen(rows, held, problem.parameters, problem.scale)
-    rows, held = rows[..., seen.kept], held[seen.kept]
-    scale, prior_sd = problem.scale[seen.kept], problem.prior_sd[seen.kept]
+    kept, left_out = what_is_seen(rows, held, problem.parameters, problem.scale)
+    rows, held = rows[..., kept], held[kept]
+    scale, prior_sd = problem.scale[kept], problem.prior_sd[kept]
     _check_count(rows, prior_sd, count, repeat)
     turn = common_coordinates(rows, held)
     prior = turn.mT @ torch.diag(held.square()) @ turn
@@ -161,9 +161,7 @@ def choose_poses(
     report(1.0)
     recommended = recommended_count(gains, least_gain)
     random_o1, random_sd = _random(rows, count, scale, prior_sd)
-    return Choice(
-        torch.tensor(chosen), gains, random_o1, random_sd, recommended, bound, settled, seen.kept, seen.left_out
-    )
+    return Choice(torch.tensor(chosen), gains, random_o1, random_sd, recommended, bound, settled, kept, left_out)
 
 
 def _random(rows: Tensor, count: int, scale: Tensor, prior_sd: Tensor) -> tuple[float, Tensor]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from ccnn_torch.coordinates import Coordinate, is_temperature
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.table import FILE, PAYLOAD, Table
-from ccnn_torch.spelling import hint, nearest
+from ccnn_torch.spelling import hint, matching, nearest
 from ccnn_torch.units import parse_header, si_unit_of, to_si
 
 # A cell so many times farther from the column's median than every other one leaves nothing of the others to learn.
@@ -43,11 +42,11 @@ def choose_covariates(
     taken = {coordinate.name for coordinate in joints} | set(pose)
     free = [name for name in table.names if name not in taken]
     if wanted is None:
-        chosen = [name for name in free if _matches(name, DEFAULT_COVARIATES)]
+        chosen = matching(free, DEFAULT_COVARIATES)
     else:
         for pattern in wanted:
             _check_wanted(pattern, free, table, joints, pose)
-        chosen = [name for name in free if _matches(name, wanted)]
+        chosen = matching(free, wanted)
     covariates, notes = [], []
     for name in chosen:
         coordinate = Coordinate(name, _si_unit(name, table, pose, {j.name: j.unit for j in joints}))
@@ -85,14 +84,19 @@ def _check_cell_sizes(values: NDArray[np.float64], name: str, table: Table) -> N
         )
 
 
-def _matches(name: str, patterns: Sequence[str]) -> bool:
-    return any(fnmatchcase(name, pattern) for pattern in patterns)
+def asked_columns(names: Sequence[str], wanted: Sequence[str] | None, whose: str) -> list[str]:
+    """Of the columns of a simulated machine those that names or patterns ask for, in their order; all where None."""
+    for pattern in wanted or ():
+        if not matching(names, [pattern]):
+            there = ", ".join(names) or "no covariates"
+            raise InputError(f"covariates: there is no column '{pattern}'; {whose} {there}")
+    return [*names] if wanted is None else matching(names, wanted)
 
 
 def _check_wanted(
     pattern: str, free: list[str], table: Table, joints: Sequence[Coordinate], pose: Mapping[str, str]
 ) -> None:
-    if _matches_any(pattern, free):
+    if matching(free, [pattern]):
         return
     if pattern in {coordinate.name for coordinate in joints}:
         raise InputError(f"covariates: '{pattern}' is a joint and an input already; remove it from the list")
@@ -100,10 +104,6 @@ def _check_wanted(
         raise InputError(f"covariates: '{pattern}' is the measured pose, which no command can know; remove it")
     near = hint(pattern, free, "the columns that could be are:")
     raise InputError(f"covariates: {table.path} has no column '{pattern}'; {near}")
-
-
-def _matches_any(pattern: str, names: list[str]) -> bool:
-    return any(fnmatchcase(name, pattern) for name in names)
 
 
 def _si_unit(name: str, table: Table, pose: Mapping[str, str], joints: Mapping[str, str]) -> str:

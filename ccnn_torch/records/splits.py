@@ -26,7 +26,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 
 import numpy as np
 import torch
@@ -34,7 +33,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.spelling import hint, nearest
+from ccnn_torch.spelling import hint, matching, nearest
 from ccnn_torch.units import to_si
 
 KINDS = ("random", "group", "block", "column")
@@ -295,7 +294,7 @@ def _cell(by: str) -> float:
 
 def _matching(entry: str, columns: Mapping[str, Column]) -> list[str]:
     """The columns that a pattern such as ``goal_*`` names; a plain name stays itself."""
-    return [name for name in columns if fnmatchcase(name, entry)] or [entry]
+    return matching(columns, [entry]) or [entry]
 
 
 def _column(name: str, columns: Mapping[str, Column]) -> NDArray[np.float64]:

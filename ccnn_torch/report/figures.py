@@ -25,7 +25,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.display import count_text, display_unit, number_text, with_unit
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.page import InlineFigure
@@ -188,8 +188,7 @@ def joint_error_plot(arrays: RunArrays) -> Plot:
     figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
     rms = float(np.sqrt(np.mean(np.square((arrays.measured - arrays.predicted)[arrays.test]))))
     same = len({joint.unit for joint in arrays.joints}) == 1
-    scale, unit = display_unit(arrays.joints[0].unit, rms)
-    amount = f", with {number_text(rms / scale, 3)} {unit} RMS left over all joints" if same else ""
+    amount = f", with {with_unit(rms, arrays.joints[0].unit)} RMS left over all joints" if same else ""
     faint = " (strong dots; faint dots are training rows)" * (len(arrays.test) <= _FAINT_UP_TO)
     floor = "; the grey band is ±2 standard deviations of the noise, which no model can remove" * (
         arrays.noise is not None

@@ -31,12 +31,12 @@ _FLAT = 1e-3
 
 
 @styled
-def machine_plot(arrays: Mapping[str, Array], after_words: str, before_words: str = "Model as it is") -> Plot | None:
+def machine_plot(arrays: Mapping[str, Array], after_words: str) -> Plot | None:
     """Position errors at the measured poses, in the plane of largest extent, before and after: arrows, or circles.
 
     Args:
         arrays: as at the top of this file; without lines the machine is left out.
-        after_words, before_words: titles of the two panels.
+        after_words: title of the second panel.
 
     Returns:
         None where the machine has no position that spans a plane, or no error in it.
@@ -71,7 +71,7 @@ def machine_plot(arrays: Mapping[str, Array], after_words: str, before_words: st
     norms = [np.linalg.norm(values, axis=-1) if arrows else values for values in (before, after)]
     sizes = [float(np.sqrt(np.square(values).mean())) for values in norms]
     scale, unit = display_unit("m", sizes[0])
-    titles = (before_words, after_words)
+    titles = ("Model as it is", after_words)
     # Between title and panel, however high this is.
     above = 1 + _ABOVE / inches[1]
     for axes, values, size, title, colour in zip(panels, (before, after), sizes, titles, (BEFORE, AFTER), strict=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from ccnn_torch.files.write import make_folder
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism, sees_directions
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records import name_lines, write_table
+from ccnn_torch.records.covariates import asked_columns
 from ccnn_torch.report.table import Table
 from ccnn_torch.simulation.acting import Injected, Wanted, act, check_bounds, read_wanted, units_of
 from ccnn_torch.simulation.config import SimulateConfig
@@ -250,7 +250,8 @@ def _situation(
     )
     situation = Situation(mechanism, joints, columns, gravity)
     columns = columns | (rest_torques(situation) if torques else {})
-    return replace(situation, covariates=_kept(columns, config.covariates))
+    names = asked_columns([*columns], config.covariates, "these rows have")
+    return replace(situation, covariates={name: columns[name] for name in names})
 
 
 def _measured(situation: Situation, frame: Tensor, sigma: Tensor, generator: torch.Generator) -> Tensor:
@@ -289,15 +290,6 @@ def _moved(frame: Tensor, change: Tensor, turns: bool) -> Tensor:
     position = frame[..., :-3] + change[..., :-3]
     turned = rotation_vector_to_matrix(change[..., -3:]) @ rotation_vector_to_matrix(frame[..., -3:])
     return torch.cat([position, matrix_to_rotation_vector(turned)], -1)
-
-
-def _kept(columns: dict[str, Tensor], wanted: list[str] | None) -> dict[str, Tensor]:
-    if wanted is None:
-        return columns
-    for pattern in wanted:
-        if not any(fnmatchcase(name, pattern) for name in columns):
-            raise InputError(f"covariates: there is no column '{pattern}'; these rows have {', '.join(columns)}")
-    return {name: v for name, v in columns.items() if any(fnmatchcase(name, pattern) for pattern in wanted)}
 
 
 def _noise(given: Noise, machine: Mechanism) -> Tensor:

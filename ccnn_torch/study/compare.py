@@ -70,7 +70,7 @@ def runs_csv(runs: Mapping[str, RunResults]) -> str:
                     continue
                 figures = [pose.before.rms, left.rms, block.ratio_to_floor, block.seconds]
                 best = int(method == results.best_method)
-                rows.append([*about, method, best, f"{kind}_rms", pose.unit, *map(_median, figures)])
+                rows.append([*about, method, best, f"{kind}_rms", pose.unit, *map(median_of, figures)])
     return csv_text(rows)
 
 
@@ -124,5 +124,6 @@ def _method_text(results: RunResults) -> str:
     return f"{geometry}{results.best_method}{of}"
 
 
-def _median(spread: Spread | None) -> float | str:
-    return "" if spread is None or spread.median is None else spread.median
+def median_of(spread: Spread | None) -> float | None:
+    """The median; None where there is no figure."""
+    return None if spread is None else spread.median

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.statistics import ratio
 from ccnn_torch.config.tree import apply_overrides, resolve_paths, validated
-from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.display import count_text, number_text, with_unit
 from ccnn_torch.engine import Engine
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_rows, write_whole
@@ -301,9 +301,7 @@ def _cases_table(comparison: SuiteResults) -> Table:
 def _case_text(case: Case) -> str:
     texts = [case.split, count_text(case.counts.train + case.counts.validation, "row")]
     if case.floor is not None and case.floor.median is not None:
-        floor = case.floor.median**0.5
-        scale, unit = display_unit(case.unit, floor)
-        texts.append(f"{number_text(floor / scale, 3)} {unit}")
+        texts.append(with_unit(case.floor.median**0.5, case.unit))
     return f"{case.name} ({', '.join(texts)})"
 
 

@@ -15,10 +15,10 @@ from ccnn_torch.display import number_text
 from ccnn_torch.engine import check_engine
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_rows
-from ccnn_torch.report.results.base import Spread
 from ccnn_torch.report.results.run import PoseFigures, RunResults
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.report.table import Table, print_table
+from ccnn_torch.study.compare import median_of
 from ccnn_torch.study.runs import Study, run_study
 
 _FIGURES = (
@@ -69,15 +69,11 @@ def _figures(results: RunResults) -> Row:
         "joint_mse_low": mse.low,
         "joint_mse_high": mse.high,
         "joint_unit": f"{joint.unit}^2",
-        "ratio_to_floor[1]": _median(block.ratio_to_floor),
+        "ratio_to_floor[1]": median_of(block.ratio_to_floor),
         **_pose("position", results.pose.position),
         **_pose("rotation", results.pose.rotation),
-        "seconds[s]": _median(block.seconds),
+        "seconds[s]": median_of(block.seconds),
     }
-
-
-def _median(spread: Spread | None) -> float | None:
-    return None if spread is None else spread.median
 
 
 def _pose(kind: str, block: PoseFigures | None) -> Row:

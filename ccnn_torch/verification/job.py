@@ -65,9 +65,18 @@ class Rows:
         """The poses, with the predicted ones in what was not measured, `s x p` [SI]."""
         return torch.where(self.pose.isnan(), self.predicted, self.pose)
 
-    def undone(self, motion: Motion) -> Tensor:
-        """The poses as they would have been measured in the model's frame, `s x p` [SI]; NaN where not measured."""
-        return torch.where(self.pose.isnan(), torch.nan, motion.undone(self.mechanism, self.whole))
+    def undone(self, motion: Tensor) -> Tensor:
+        """The poses as they would have been measured in the model's frame, `s x p` [SI]; NaN where not measured.
+
+        motion: `6`, position [m] and rotation vector [rad], from the model's measuring frame into the new one.
+        """
+        if not bool(motion.any()):
+            return self.pose
+        position, rotation = self.mechanism.frame(self.whole)
+        turn = rotation_vector_to_matrix(motion[3:]).mT
+        place = ((position - motion[:3])[..., None, :] @ turn.mT)[..., 0, :]
+        before = self.mechanism.pose_near(place, None if rotation is None else turn @ rotation)
+        return torch.where(self.pose.isnan(), torch.nan, before)
 
 
 def nominal_mechanism(
@@ -200,7 +209,7 @@ def pseudoerror_settings(model: LoadedModel, machine: Mechanism) -> dict[str, An
 
 
 def judge(
-    rows: Rows, compensated: bool, motions: list[Motion], settings: Mapping[str, Any]
+    rows: Rows, compensated: bool, motions: list[Tensor], settings: Mapping[str, Any]
 ) -> tuple[PoseError, PoseError, Tensor, Tensor, Tensor]:
     """Pose error before and after, `s`; joint deviation before and after, `s x n` [SI]; rows with one, `s`."""
     machine = rows.mechanism
@@ -218,7 +227,7 @@ def judge(
     return before, after, found.deviation, found.deviation - rows.deviation, found.usable
 
 
-def gaps(rows: Rows, compensated: bool, motions: list[Motion]) -> tuple[Tensor, Tensor, Tensor]:
+def gaps(rows: Rows, compensated: bool, motions: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """Measured positions, and from where they should be to where they are before and after, `s x 3` each [m]."""
     machine = rows.mechanism
     nominal, predicted = (machine.frame(pose)[0] for pose in (rows.nominal, rows.predicted))
@@ -231,44 +240,25 @@ def gaps(rows: Rows, compensated: bool, motions: list[Motion]) -> tuple[Tensor, 
 _NEEDED = 4
 
 
-@dataclass(frozen=True)
-class Motion:
-    """A rigid motion `6`: position [m] and rotation vector [rad], from the model's measuring frame into the new one."""
-
-    frame: Tensor
-
-    @classmethod
-    def none(cls) -> Motion:
-        return cls(torch.zeros(6, dtype=torch.float64))
-
-    @staticmethod
-    def fits(mechanism: Mechanism) -> bool:
-        """Whether poses of this mechanism can be moved in space."""
-        names = {c.name for c in mechanism.pose}
-        return names in ({"x", "y", "z"}, {"x", "y", "z", "rx", "ry", "rz"})
-
-    def undone(self, mechanism: Mechanism, pose: Tensor) -> Tensor:
-        """Poses `s x p` as they would have been measured in the model's frame."""
-        if not bool(self.frame.any()):
-            return pose
-        position, rotation = mechanism.frame(pose)
-        turn = rotation_vector_to_matrix(self.frame[3:]).mT
-        place = ((position - self.frame[:3])[..., None, :] @ turn.mT)[..., 0, :]
-        return mechanism.pose_near(place, None if rotation is None else turn @ rotation)
-
-    @property
-    def words(self) -> str:
-        shift, turn = self.frame[:3].norm(), self.frame[3:].norm()
-        return f"{1e3 * float(shift):.3g} mm and {1e3 * float(turn):.3g} mrad"
+def can_be_moved(mechanism: Mechanism) -> bool:
+    """Whether poses of this mechanism can be moved in space."""
+    names = {c.name for c in mechanism.pose}
+    return names in ({"x", "y", "z"}, {"x", "y", "z", "rx", "ry", "rz"})
 
 
-def fit_motion(mechanism: Mechanism, expected: Tensor, measured: Tensor) -> Motion:
-    """The motion that takes expected poses nearest to those measured, `s x p` [SI] each; whole ones (no NaN) count.
+def motion_text(motion: Tensor) -> str:
+    """How far a rigid motion goes, and how far it turns."""
+    return f"{1e3 * float(motion[:3].norm()):.3g} mm and {1e3 * float(motion[3:].norm()):.3g} mrad"
+
+
+def fit_motion(mechanism: Mechanism, expected: Tensor, measured: Tensor) -> Tensor:
+    """The motion `6`, position [m] and rotation vector [rad], that takes expected poses nearest to those measured,
+    `s x p` [SI] each; whole ones (no NaN) count.
 
     Raises:
         InputError: the mechanism's poses cannot be moved in space, or the rows are too few.
     """
-    if not Motion.fits(mechanism):
+    if not can_be_moved(mechanism):
         names = ", ".join(c.name for c in mechanism.pose)
         raise InputError(
             f"--refit-frames: the pose of {mechanism.name} is {names}, and a frame can be fitted to x, y, z only "
@@ -279,7 +269,7 @@ def fit_motion(mechanism: Mechanism, expected: Tensor, measured: Tensor) -> Moti
         raise InputError(f"--refit-frames: {int(whole.sum())} rows are too few to fit a frame; give {_NEEDED} or more")
     expected, measured = expected[whole], measured[whole]
     weights = torch.ones(len(measured), dtype=torch.float64)
-    return Motion(rigid_body_frame(mechanism.frame(expected), mechanism.frame(measured), weights, ROTATION_WEIGHT))
+    return rigid_body_frame(mechanism.frame(expected), mechanism.frame(measured), weights, ROTATION_WEIGHT)
 
 
 # A moved measuring frame is suspected if correcting it halves the remaining RMS error at least, and leaves no more than
@@ -294,8 +284,8 @@ def verify_model(
     compensated: bool = False,
     refit_frames: bool = False,
     **how: Any,
-) -> Verified:
-    """Judge a model on new rows.
+) -> tuple[VerifyResults, RunArrays]:
+    """Judge a model on new rows; also gives the arrays that its pictures need, all rows held out.
 
     Without `compensated` the joints are commands and the pose is what the uncompensated machine reached: before = its
     distance from the nominal machine's pose, after = from the pose that the model predicts, as `pose` of a run's
@@ -317,7 +307,7 @@ def verify_model(
     if refit_frames:
         motions = [fit_motion(rows.mechanism, at, rows.pose) for at in (rows.nominal, rows.predicted)]
     else:
-        motions = [Motion.none(), Motion.none()]
+        motions = [torch.zeros(6, dtype=torch.float64)] * 2
     before, after, measured, left, usable = judge(rows, compensated, motions, pseudoerror_settings(model, machine))
     groups = configurations(rows.joints, machine.joints)
     promise = promise_of(model)
@@ -363,13 +353,13 @@ def verify_model(
     results.text = verify_text(results)
     if loaded.data_hash == model.facts.get("data_sha256"):
         results.text = f"These are the rows that the model was made from, so this is no test. {results.text}"
-    return Verified(results, figure_arrays(rows, measured, left, before, after))
+    return results, figure_arrays(rows, measured, left, before, after)
 
 
 def _moved(rows: Rows, results: VerifyResults) -> list[str]:
     """A sentence if a moved measuring frame explains at least half of the remaining error."""
     whole = ~rows.pose.isnan().any(-1)
-    if results.kept or not Motion.fits(rows.mechanism) or min(results.configurations, int(whole.sum())) < 4:
+    if results.kept or not can_be_moved(rows.mechanism) or min(results.configurations, int(whole.sum())) < 4:
         return []
     at = rows.nominal if results.compensated else rows.predicted
     motion = fit_motion(rows.mechanism, at, rows.pose)
@@ -379,16 +369,8 @@ def _moved(rows: Rows, results: VerifyResults) -> list[str]:
         return []
     return [
         f"The measuring device seems to have moved since the model was made: a rigid motion of its frame by "
-        f"{motion.words} would leave {1e3 * left:.3g} mm RMS; if it was moved, judge with --refit-frames."
+        f"{motion_text(motion)} would leave {1e3 * left:.3g} mm RMS; if it was moved, judge with --refit-frames."
     ]
-
-
-@dataclass(frozen=True)
-class Verified:
-    """What was found, and the arrays that its pictures need, all rows held out."""
-
-    results: VerifyResults
-    arrays: RunArrays
 
 
 def error_of(unit: Length, before: Tensor | None, after: Tensor | None, promise: Promised | None) -> Error | None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.page.data import NEXT, About
 from ccnn_torch.diagnosis.page.tables import quantity_text, write_next_csv
-from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.display import count_text, display_unit, number_text, with_unit
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.page import Answer, Page, sections_of
@@ -70,9 +70,8 @@ def since_tables(results: SinceResults, joints: Sequence[Coordinate]) -> list[Ta
     numbers = []
     for told in results.changed:
         for one in told.numbers:
-            scale, unit = display_unit(one.unit, abs(one.value))
-            value, sd = (number_text(v / scale, 3) for v in (one.value, one.sd))
-            numbers.append((told.text, one.name, f"{value} {unit}", f"{sd} {unit}", " or ".join(told.instead) or "–"))
+            value, sd = (with_unit(v, one.unit, like=one.value) for v in (one.value, one.sd))
+            numbers.append((told.text, one.name, value, sd, " or ".join(told.instead) or "–"))
     columns = ("what", "number", "more than in the model", "standard deviation", "these rows do not tell it from")
     changed = Table("What changed?", columns, numbers, words=("number", columns[-1])) if numbers else None
     gaps = []
@@ -87,11 +86,10 @@ def since_tables(results: SinceResults, joints: Sequence[Coordinate]) -> list[Ta
         "rows held out when the model was made."
     )
     errors = Table("Error of the new rows about the model", ("", "RMS", "explained", "promised"), gaps, note)
-    rows = []
-    for change in results.changes:
-        scale, unit = display_unit(change.unit, change.seen_from)
-        size = "–" if change.seen_from is None else f"{number_text(change.seen_from / scale, 2)} {unit}"
-        rows.append((change.text, number_text(change.probability, 2), size))
+    rows = [
+        (change.text, number_text(change.probability, 2), with_unit(change.seen_from, change.unit, 2))
+        for change in results.changes
+    ]
     note = "Seen from: the smallest change of one number that these rows would have shown, with odds of about 20 to 1."
     weighed = Table("What was weighed?", ("change", "probability", "seen from"), rows, note)
     text = {change.name: change.text for change in results.changes}
@@ -208,15 +206,13 @@ def verify_tables(results: VerifyResults) -> list[Table]:
 
 
 def _left(block: Error, kind: str) -> str:
-    scale, unit = display_unit(block.unit, block.before.rms)
-    after, before = (number_text(block[when].rms / scale, 3) for when in ("after", "before"))
-    return f"{after} {unit} RMS of {kind} (before {before} {unit})"
+    after, before = (with_unit(block[when].rms, block.unit, like=block.before.rms) for when in ("after", "before"))
+    return f"{after} RMS of {kind} (before {before})"
 
 
 def _limit(block: Error, promised: Promised, kind: str) -> str:
-    scale, unit = display_unit(block.unit, block.before.rms)
-    rms, high = (number_text(value / scale, 3) for value in (promised.rms, promised.high))
-    return f"{rms} {unit}, at most {high} {unit} at 95 % ({kind})"
+    rms, high = (with_unit(value, block.unit, like=block.before.rms) for value in (promised.rms, promised.high))
+    return f"{rms}, at most {high} at 95 % ({kind})"
 
 
 def _promise_cells(block: Error, scale: float, when: str) -> tuple[str, str]:

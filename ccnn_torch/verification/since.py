@@ -20,7 +20,7 @@ from torch import Tensor
 from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.diagnosis.candidates.atom import Atom, scaled_signature
 from ccnn_torch.diagnosis.residual.whitening import moving_channels, without_fitted
-from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.display import count_text, display_unit, with_unit
 from ccnn_torch.effects import (
     Coefficient,
     Situation,
@@ -44,7 +44,7 @@ from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.designs import Candidates
 from ccnn_torch.report.results.verify import Change, ChangedNumber, Gap, NextPose, SinceResults, Told
-from ccnn_torch.verification.job import Motion, Rows, fit_motion, new_rows, predict
+from ccnn_torch.verification.job import Rows, can_be_moved, fit_motion, motion_text, new_rows, predict
 from ccnn_torch.verification.promise import configurations, promise_of
 
 _T = TypeVar("_T")
@@ -83,7 +83,8 @@ class _Rows:
             0 where it was not measured.
         channels: which of the pose's channels, `c`.
         noise_dof: weight of that noise, in values.
-        moved: how the measuring device stands elsewhere than when the model was made; no motion where it does not.
+        moved: how the measuring device stands elsewhere than when the model was made, as of `fit_motion`; 0 where it
+            does not.
         promise: RMS that the model promises of `position` [m] and `rotation` [rad].
     """
 
@@ -93,7 +94,7 @@ class _Rows:
     scale: Tensor
     channels: Tensor
     noise_dof: float
-    moved: Motion
+    moved: Tensor
     promise: Mapping[str, float]
 
     @property
@@ -134,14 +135,14 @@ def what_changed(
     x = [a.columns[:, rows.channels] * rows.scale[..., None] for a in atoms]
     y = rows.residual * rows.scale
     notes = list(loaded.missing)
-    if bool(rows.moved.frame.any()):
+    if bool(rows.moved.any()):
         # What a motion of the device does, too, is not seen any more.
         frame = next(k for k, a in enumerate(atoms) if a.name == Frame.name)
         first, *rest = without_fitted(x[frame], [y[..., None], *x])
         y, x, atoms = first[..., 0], _but(rest, frame), _but(atoms, frame)
         notes.append(
-            f"The measuring device stands elsewhere than when the model was made, by {rows.moved.words}: this was "
-            "taken off, and what looks like it is not seen in these rows."
+            f"The measuring device stands elsewhere than when the model was made, by {motion_text(rows.moved)}: this "
+            "was taken off, and what looks like it is not seen in these rows."
         )
     dictionary, sets = search(atoms, x, y, rows.noise_dof, values=rows.values)
     sets = [found for found in sets if not _is_a_zero_alone(rows, dictionary, found)]
@@ -201,14 +202,14 @@ def _rows_of(model: LoadedModel, machine: Mechanism, loaded: Any) -> _Rows:
     return _Rows(situation, filled, groups, scale, channels, dof, moved, kept)
 
 
-def _moved(found: Rows) -> Motion:
+def _moved(found: Rows) -> Tensor:
     """The rigid motion of a measuring device that was set up anew; none where it is so small that it is a candidate."""
-    mechanism = found.mechanism
-    if not Motion.fits(mechanism) or int((~found.pose.isnan().any(-1)).sum()) < FEWEST:
-        return Motion.none()
-    motion = fit_motion(mechanism, found.predicted, found.pose)
-    shift, turn = float(motion.frame[:3].norm()), float(motion.frame[3:].norm())
-    return motion if shift > _FAR["m"] or turn > _FAR["rad"] else Motion.none()
+    none = torch.zeros(6, dtype=torch.float64)
+    if not can_be_moved(found.mechanism) or int((~found.pose.isnan().any(-1)).sum()) < FEWEST:
+        return none
+    motion = fit_motion(found.mechanism, found.predicted, found.pose)
+    far = bool(motion[:3].norm() > _FAR["m"]) or bool(motion[3:].norm() > _FAR["rad"])
+    return motion if far else none
 
 
 def _may_change(model: LoadedModel, mechanism: Mechanism) -> list[str]:
@@ -446,10 +447,9 @@ def _best(rows: _Rows, there: Situation, asked: Candidates, separates: list[str]
 
 def since_text(results: SinceResults) -> str:
     """The verdict in two or three sentences."""
-    scale, unit = display_unit(results.position.unit, results.position.before)
     what = "position" if results.position.unit == "m" else "direction"
     before, after, promised = (
-        None if v is None else f"{number_text(v / scale, 3)} {unit}"
+        with_unit(v, results.position.unit, like=results.position.before)
         for v in (results.position.before, results.position.after, results.position.promised)
     )
     rows = count_text(results.rows, "new row")

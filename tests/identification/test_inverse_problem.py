@@ -11,7 +11,7 @@ from mechanisms.five_bar import FiveBar as ClosureAlone
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import ParameterChoice, inverse_problem, solve_lm
-from ccnn_torch.identification.problems.problem import SparseResidual, row_jacobian
+from ccnn_torch.identification.problems.problem import row_jacobian
 from ccnn_torch.mechanisms import load_mechanism
 
 
@@ -44,7 +44,6 @@ def test_the_quick_jacobian_is_that_of_the_residual(name: str, per_leg: bool) ->
     rows = measured(2, 24, 3, name=name)
     problem = inverse_problem(rows.mechanism, rows.joints, rows.pose, pose_noise=NOISE, per_leg=per_leg)
     point = rows.truth[:, None].expand(2, 24, -1)
-    assert isinstance(problem.residual, SparseResidual)
     value, slope = problem.residual.jacobian(point, problem.data)
     torch.testing.assert_close(value, problem.residual(point, *problem.data), rtol=1e-12, atol=1e-12)
     step = 1e-3 * problem.scale
@@ -63,7 +62,7 @@ def test_large_batches_take_the_same_jacobian_as_small_ones() -> None:
         return torch.stack([torch.sin(x).prod(-1) * row[..., 0], x.square().sum(-1)], dim=-1)
 
     row = torch.linspace(1, 2, 3000, dtype=torch.float64)[:, None]
-    whole = row_jacobian(function, values, (row,))
+    whole = row_jacobian(function, values, (row,), 2)
     parts = [row_jacobian(function, v, (d,), 2) for v, d in zip(values.split(500), row.split(500), strict=True)]
     for i in range(2):
         torch.testing.assert_close(whole[i], torch.cat([p[i] for p in parts]), rtol=1e-14, atol=1e-14)

@@ -66,7 +66,7 @@ def test_an_error_of_a_joint_acts_in_both_places(tmp_path: Path, cli: Callable[.
     assert code == 0, out + err
     model = load_compensation(tmp_path / "d" / "diagnosis.json")
     assert [j.name for j in model.joints] == ["q1", "q2", "q3", "q4", "q5", "q6"]
-    said = verify_model(model, str(later), "instrument", mechanism_keys=between(tmp_path)).results.position
+    said = verify_model(model, str(later), "instrument", mechanism_keys=between(tmp_path))[0].position
     # Effects on both joints, at their own amplitude: half of it would leave half of the gap.
     assert said.after.rms < 1.2 * NOISE < 4 * NOISE < said.before.rms
     wanted = joints(40, 6)
@@ -103,7 +103,7 @@ def test_a_run_identifies_from_both_places_and_keeps_its_promise(tmp_path: Path)
     found.save(tmp_path / "model", forms=["safetensors"])
     model = load_compensation(tmp_path / "model" / "model.safetensors")
     later = str(pairs(tmp_path / "b.csv", 40, 5, gear))
-    said = verify_model(model, later, "instrument", mechanism_keys=keys["mechanism_keys"]).results
+    said = verify_model(model, later, "instrument", mechanism_keys=keys["mechanism_keys"])[0]
     assert said.kept and said.position.after.rms < 1.2 * NOISE
     # Trusted where either place was: the same joints as the first place and as the second.
     table = read_table(Path(keys["records"]))

@@ -338,5 +338,5 @@ def test_a_model_is_verified_by_the_pixels_of_another_day(
     lens |= {name: values[f"camera_{name}"] for name in ("k1", "k2")}
     model = load_compensation(tmp_path / "found" / "identified.yaml")
     about = {"mechanism": keys["mechanism_keys"]["mechanism"], "kind": "camera", **lens}
-    said = verify_model(model, str(later), "instrument", mechanism_keys=about).results
+    said = verify_model(model, str(later), "instrument", mechanism_keys=about)[0]
     assert said.position.after.rms < 2.5 * math.sqrt(2) * 0.2 * PIXEL < 0.2 * said.position.before.rms

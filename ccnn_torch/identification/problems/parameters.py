@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import fnmatch
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -15,6 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter, plausible_error
 from ccnn_torch.errors import InputError
+from ccnn_torch.spelling import hint, matching
 
 
 @dataclass(frozen=True)
@@ -127,20 +126,14 @@ def match_parameters(geometry: Sequence[Parameter], patterns: Sequence[str], key
         of_leg = re.fullmatch(r"leg(\d+)\.(.*)", pattern)
         if of_leg:
             leg, inner = int(of_leg[1]), of_leg[2]
-            fits = {g.name for g in geometry if g.leg == leg and fnmatch.fnmatchcase(g.name, inner)}
+            fits = matching([g.name for g in geometry if g.leg == leg], [inner])
         else:
-            fits = {g.name for g in geometry if fnmatch.fnmatchcase(g.name, pattern)}
+            fits = matching([g.name for g in geometry], [pattern])
         if not fits:
-            raise InputError(f"parameters.{key}: '{pattern}' fits no parameter; {_hint(geometry, pattern)}")
-        found |= fits
+            names = [g.name for g in geometry] + [f"leg{g.leg}.{g.name}" for g in geometry if g.leg is not None]
+            raise InputError(f"parameters.{key}: '{pattern}' fits no parameter; {hint(pattern, names, 'known:')}")
+        found.update(fits)
     return found
-
-
-def _hint(geometry: Sequence[Parameter], pattern: str) -> str:
-    names = [g.name for g in geometry] + [f"leg{g.leg}.{g.name}" for g in geometry if g.leg is not None]
-    near = difflib.get_close_matches(pattern, names, 1)
-    known = ", ".join(g.name for g in geometry)
-    return f"did you mean '{near[0]}'? known: {known}" if near else f"known: {known}"
 
 
 def _groups(

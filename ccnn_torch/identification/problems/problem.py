@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
+from ccnn_torch.numerics.least_squares import jacobian_of
 
 Progress = Callable[[float], None]
 """Told the share that is done, 0 to 1."""
@@ -119,7 +120,7 @@ _SMALL = 20_000
 
 
 def row_jacobian(
-    function: Callable[..., Tensor], values: Tensor, data: tuple[Tensor, ...], channels: int | None = None
+    function: Callable[..., Tensor], values: Tensor, data: tuple[Tensor, ...], channels: int
 ) -> tuple[Tensor, Tensor]:
     """Residual and Jacobian of every row by reverse differentiation, without a graph that could be differentiated.
 
@@ -130,42 +131,18 @@ def row_jacobian(
         function: `(values, *data)` -> `... x c`, leading dims independent.
         values: `... x k`, one set for each row.
         data: `... x d` each.
-        channels: `c`; found by a call when None.
+        channels: `c`.
 
     Returns:
         residual `... x c` and Jacobian `... x c x k`.
     """
-    if channels is None:
-        with torch.no_grad():
-            channels = function(values[..., :1, :], *(d[..., :1, :] for d in data)).shape[-1]
-    together = channels > 1 and values.numel() * channels <= _SMALL
-    point = values.detach()
-    point = (point.expand(channels, *values.shape) if together else point).clone().requires_grad_()
+    if channels == 1 or values.numel() * channels > _SMALL:
+        return jacobian_of(lambda point: function(point, *data), values)
+    copies = values.detach().expand(channels, *values.shape).clone().requires_grad_()
     with torch.enable_grad():
-        value = function(point, *data)
-        if together or channels == 1:
-            picked = value.diagonal(dim1=0, dim2=-1).sum() if together else value.sum()
-            slope = torch.autograd.grad(picked, point, materialize_grads=True)[0]
-            return (value[0] if together else value).detach(), slope.movedim(0, -2) if together else slope.unsqueeze(-2)
-        columns = [column.sum() for column in value.unbind(-1)]
-    parts = [
-        torch.autograd.grad(column, point, retain_graph=i + 1 < channels, materialize_grads=True)[0]
-        for i, column in enumerate(columns)
-    ]
-    return value.detach(), torch.stack(parts, dim=-2)
-
-
-@runtime_checkable
-class SparseResidual(Protocol):
-    """A residual with a Jacobian of its own."""
-
-    def __call__(self, values: Tensor, *data: Tensor) -> Tensor:
-        """As `Problem.residual`."""
-        ...
-
-    def jacobian(self, values: Tensor, data: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """As `row_jacobian` of it."""
-        ...
+        value = function(copies, *data)
+        slope = torch.autograd.grad(value.diagonal(dim1=0, dim2=-1).sum(), copies, materialize_grads=True)[0]
+    return value[0].detach(), slope.movedim(0, -2)
 
 
 class WeightedRows:
@@ -180,7 +157,7 @@ class WeightedRows:
         whole = bool(kept.all())
         self.function = problem.residual
         # A residual that knows which of its entries share no parameter differentiates itself.
-        self.quick = problem.residual.jacobian if isinstance(problem.residual, SparseResidual) else None
+        self.quick = getattr(problem.residual, "jacobian", None)
         self.data = problem.data if whole else tuple(d[:, kept] for d in problem.data)
         self.weights = problem.weights if whole else problem.weights[:, kept]
         self.alike = whole and bool((self.weights == 1).all())

@@ -17,12 +17,11 @@ from ccnn_torch.mechanisms import Mechanism
 
 @dataclass(frozen=True)
 class MeasuredRows:
-    """joints `r x s x n`, pose `r x s x p` (r = 1 where the machines share them), weights `r x s`; `r` machines."""
+    """joints `r x s x n`, pose `r x s x p` (r = 1 where the machines share them), weights `r x s`."""
 
     joints: Tensor
     pose: Tensor
     weights: Tensor
-    machines: int
 
 
 def gather_rows(
@@ -68,7 +67,7 @@ def gather_rows(
                 f"row {int(wrong[0, 1]) + 1}: {coordinates[int(wrong[0, 2])].name} is not a finite number; "
                 "measure it again or leave the row out"
             )
-    return MeasuredRows(q, x, w.to(torch.float64).expand(machines, -1), machines)
+    return MeasuredRows(q, x, w.to(torch.float64).expand(machines, -1))
 
 
 def covariance(
@@ -282,7 +281,7 @@ def whitened_problem(
     """
     if not noise_known and bool(torch.isfinite(selection.prior_sd).any()):
         raise InputError("parameters.prior: a prior can be weighed against the rows only if their noise is given")
-    begin = selection.start.expand(rows.machines, -1)
+    begin = selection.start.expand(len(rows.weights), -1)
     c = len(names)
     moved = dependence(gap, begin[0], selection.scale, tuple(d[0] for d in data), rows.weights[0] > 0, c)
     kept = [i for i in range(c) if bool(moved[i].any())] if per_leg else list(range(c))

@@ -155,7 +155,7 @@ class HybridGenetic:
     def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
         """Minimise; machine i draws its numbers from seed + i alone."""
         objective = Objective(problem)
-        tell = progress or _silent
+        tell = progress or (lambda _: None)
         share = _GENETIC_SHARE if self.sqp else 1.0
         best, cost, generations, settled = self._evolve(objective, seed, lambda done: tell(share * done))
         evaluations = self.population * (generations + 1)
@@ -280,7 +280,3 @@ def _message(settled: Tensor, sqp: bool) -> str:
         return ""
     what = "quadratic programming still gained" if sqp else "the genetic algorithm still gained when it had to stop"
     return f"{len(failed)} of {len(settled)} machines did not settle; for the first (index {int(failed[0])}) {what}"
-
-
-def _silent(_: float) -> None:
-    """Progress that is not shown."""

@@ -440,8 +440,6 @@ class _Problem:
         rows = rows * self.weights.sqrt()[..., None, None]
         place, column = self._columns(free.shape[-1])
         prior = torch.diag_embed(self._prior(free)[1])
-        if free.shape[-1] == len(place):  # one group: every free parameter acts on every row
-            return torch.cat([rows[..., place].flatten(-3, -2), prior], dim=-2)
         spread = torch.zeros(*rows.shape[:-1], free.shape[-1], dtype=rows.dtype)
         spread.scatter_(-1, column[:, None, :].expand(*rows.shape[:-1], -1), rows[..., place])
         return torch.cat([spread.flatten(-3, -2), prior], dim=-2)

@@ -129,10 +129,6 @@ class Framed(Around):
         near = None if guess is None else self.mechanism.pose_near(*self.unseen(guess, values)).detach()
         return self.seen(self.mechanism.forward_kinematics(joints, self.split(values)[1], near), values)
 
-    def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x p`."""
-        return frame_gap(self.frame(self.forward_kinematics(joints, parameters, pose)), self.frame(pose), 1.0)
-
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Joints of the closest pose: both frames are taken off, then the mechanism's own inverse kinematics."""
         return self.nearest_joints(pose, parameters, guess, self.rotation_weight)

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.closest import Closest
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.mechanisms.newton import carry_derivative, nearest
-from ccnn_torch.mechanisms.pose import Frame, frame_gap
-from ccnn_torch.numerics.batching import expand_leading, leading_shape
+from ccnn_torch.mechanisms.pose import Frame
+from ccnn_torch.numerics.batching import leading_shape
 
 
-class Around(Mechanism):
+class Around(Closest):
     """A mechanism that is another one, `mechanism`, seen or placed in some way."""
 
     mechanism: Mechanism
@@ -36,9 +36,6 @@ class Around(Mechanism):
     def lacking(self, conditions: Sequence[str]) -> list[Condition]:
         """As of the mechanism inside."""
         return self.mechanism.lacking(conditions)
-
-
-_ROTATION_WEIGHT = 0.04
 
 
 class Seen(Around, ABC):
@@ -99,58 +96,13 @@ class Seen(Around, ABC):
     def around(self, mechanism: Mechanism) -> Seen:
         """Another mechanism seen in the same way."""
 
-    def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 6` or `x 3`."""
-        return self._gap(joints, self.resolve(parameters), pose, 1.0)
-
     def controlled(self) -> Mechanism:
         """As of the mechanism inside."""
         return self.mechanism.controlled()
 
-    def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
-        """What is seen of samples of the mechanism; `count x p` [SI]."""
-        return self.forward_kinematics(self.mechanism.sample_joints(count, generator))
-
     def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:
         """Of the mechanism, `count x n` [SI]."""
         return self.mechanism.sample_joints(count, generator)
-
-    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
-        """Joints nearest to the guess whose pose has these coordinates, `... x n` [SI]; differentiable."""
-        values = self.resolve(parameters)
-        found = self.nearest_joints(pose, values, guess, _ROTATION_WEIGHT)
-        slope = self._slope(found, values, pose, _ROTATION_WEIGHT)
-        return carry_derivative(found, slope, self._gap(found, values, pose, _ROTATION_WEIGHT))
-
-    def nearest_joints(
-        self,
-        pose: Tensor,
-        parameters: Tensor | None,
-        guess: Tensor | None,
-        rotation_weight: float,
-        damping: float = 0.0,
-    ) -> Tensor:
-        """See `Mechanism.nearest_joints`; of joints that reach the same the nearest to the guess. No gradient."""
-        values = self.resolve(parameters)
-        anchor = expand_leading(self.home_joints if guess is None else guess, pose, values).detach()
-
-        def gap(q: Tensor, v: Tensor, x: Tensor) -> Tensor:
-            return self._gap(q, v, x, rotation_weight)
-
-        def slope(q: Tensor, v: Tensor, x: Tensor) -> Tensor:
-            return self._slope(q, v, x, rotation_weight)
-
-        return nearest(gap, slope, anchor, (values, pose), damping, len(self.joints) > self.compared)
-
-    def singular_values(
-        self,
-        joints: Tensor,
-        rotation_weight: float = _ROTATION_WEIGHT,
-        parameters: Tensor | None = None,
-        guess: Tensor | None = None,
-    ) -> Tensor:
-        """See `Mechanism.singular_values`; as many as there are readings."""
-        return super().singular_values(joints, rotation_weight, parameters, guess)[..., : self.compared]
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """All that is finite: what is not seen may be anything; `...`, bool."""
@@ -160,16 +112,6 @@ class Seen(Around, ABC):
         """As of the mechanism, in the pose of the joints."""
         inner = self.inner_values(parameters)
         return self.mechanism.skeleton(self.mechanism.forward_kinematics(joints, inner), joints, inner)
-
-    def _slope(self, joints: Tensor, values: Tensor, pose: Tensor, rotation_weight: float) -> Tensor:
-        """The Jacobian with its rotation rows weighed, 0 where there is no pose."""
-        rows = torch.nan_to_num(self.jacobian(joints, values, pose))
-        return rows * self.channel_weights(rotation_weight)[:, None]
-
-    def _gap(self, joints: Tensor, values: Tensor, pose: Tensor, rotation_weight: float) -> Tensor:
-        """From the pose to that of the joints, weighed alike."""
-        gap = frame_gap(self.frame(self.forward_kinematics(joints, values, pose)), self.frame(pose), 1.0)
-        return gap * self.channel_weights(rotation_weight)
 
 
 class Partial(Seen):

@@ -23,7 +23,43 @@ GIVE = {"m": 1e-7, "rad": 2e-6}
 """Plausible compliance of a drive: 1e-7 m/N (10 N/µm), 2e-6 rad/(N·m)."""
 
 
-class Giving(Mechanism):
+class _Columned(Mechanism):
+    """A machine with further columns behind its joints, and other parameters; its poses are the machine's."""
+
+    def __init__(self, machine: Mechanism, more: Sequence[Coordinate], geometry: Sequence[Parameter]) -> None:
+        super().__init__(
+            name=machine.name,
+            joints=[*machine.joints, *more],
+            pose=machine.pose,
+            geometry=geometry,
+            low=machine.low.tolist(),
+            high=machine.high.tolist(),
+            home_pose=machine.home_pose.tolist(),
+            home_joints=[*machine.home_joints.tolist(), *(0.0 for _ in more)],
+        )
+        self.machine, self.orientations = machine, machine.orientations
+
+    def inside(self, joints: Tensor, parameters: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Joints of the machine, and its parameters there."""
+        raise NotImplementedError
+
+    def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """As of an arm."""
+        assert isinstance(self.machine, SerialArm | SetUps)
+        return self.machine.forward_frame(*self.inside(joints, parameters))
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """As of the machine."""
+        return self.machine.forward_kinematics(*self.inside(joints, parameters), guess)
+
+    def frame(self, pose: Tensor) -> Frame:
+        """As of the machine."""
+        return self.machine.frame(pose)
+
+
+class Giving(_Columned):
     """A machine with the compliance of some joints as parameters behind its own, `compliance q2`.
 
     Its joints are those of the machine and, as the last columns, the force or torque of each of these drives: joint i
@@ -36,20 +72,9 @@ class Giving(Mechanism):
     def __init__(self, machine: Mechanism, giving: Sequence[int]) -> None:
         """giving: numbers of the joints that give, from 0."""
         joints = [machine.joints[i] for i in giving]
-        super().__init__(
-            name=machine.name,
-            joints=[*machine.joints, *(Coordinate(torque_of(j), force_of(j.unit)) for j in joints)],
-            pose=machine.pose,
-            geometry=[
-                *machine.geometry,
-                *(Parameter(f"compliance {j.name}", per_force(j.unit), 0.0, scale=GIVE[j.unit]) for j in joints),
-            ],
-            low=machine.low.tolist(),
-            high=machine.high.tolist(),
-            home_pose=machine.home_pose.tolist(),
-            home_joints=[*machine.home_joints.tolist(), *(0.0 for _ in joints)],
-        )
-        self.machine, self.orientations = machine, machine.orientations
+        own = [Parameter(f"compliance {j.name}", per_force(j.unit), 0.0, scale=GIVE[j.unit]) for j in joints]
+        torques = [Coordinate(torque_of(j), force_of(j.unit)) for j in joints]
+        super().__init__(machine, torques, [*machine.geometry, *own])
         self._moves = torch.eye(len(machine.joints), dtype=torch.float64)[list(giving)]
 
     def one(self, parameters: Tensor) -> Mechanism:
@@ -57,28 +82,13 @@ class Giving(Mechanism):
         values = parameters[: len(self.machine.geometry)]
         return self.machine.one(values) if isinstance(self.machine, SetUps) else self.machine.with_nominal(values)
 
-    def _stiff(self, joints: Tensor, parameters: Tensor | None) -> tuple[Tensor, Tensor]:
+    def inside(self, joints: Tensor, parameters: Tensor | None) -> tuple[Tensor, Tensor]:
         """Joints where they are, and the parameters of the stiff machine."""
         values, n, k = self.resolve(parameters), len(self.machine.joints), len(self.machine.geometry)
         return joints[..., :n] + (values[..., k:] * joints[..., n:]) @ self._moves, values[..., :k]
 
-    def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As of an arm."""
-        assert isinstance(self.machine, SerialArm | SetUps)
-        return self.machine.forward_frame(*self._stiff(joints, parameters))
 
-    def forward_kinematics(
-        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
-    ) -> Tensor:
-        """As of the machine."""
-        return self.machine.forward_kinematics(*self._stiff(joints, parameters), guess)
-
-    def frame(self, pose: Tensor) -> Frame:
-        """As of the machine."""
-        return self.machine.frame(pose)
-
-
-class SetUps(Mechanism):
+class SetUps(_Columned):
     """An arm or a framed machine with a base frame for each group of `frame_per`, a tool frame for each of `tool_per`.
 
     Its joints are those of the machine and, as the last column, the number of the row's set-up. Its parameters
@@ -101,22 +111,12 @@ class SetUps(Mechanism):
             return [Parameter(f"{p.name} {g}" if named else p.name, p.unit, p.nominal) for g, p in each]
 
         first, last = self._sizes[0], len(machine.geometry) - self._sizes[1]
-        super().__init__(
-            name=machine.name,
-            joints=[*machine.joints, Coordinate("set-up", "1")],
-            pose=machine.pose,
-            geometry=[
-                *of(machine.geometry[:first], bases, bool(machine.frame_per)),
-                *machine.geometry[first:last],
-                *of(machine.geometry[last:], tools, bool(machine.tool_per)),
-            ],
-            low=machine.low.tolist(),
-            high=machine.high.tolist(),
-            home_pose=machine.home_pose.tolist(),
-            home_joints=[*machine.home_joints.tolist(), 0.0],
-        )
-        self.machine = machine
-        self.orientations = machine.orientations
+        own = [
+            *of(machine.geometry[:first], bases, bool(machine.frame_per)),
+            *machine.geometry[first:last],
+            *of(machine.geometry[last:], tools, bool(machine.tool_per)),
+        ]
+        super().__init__(machine, [Coordinate("set-up", "1")], own)
         # Declared values are not the nominal ones of an arm whose frames were found before.
         every = torch.arange(len(bases) * len(tools))
         self.nominal.copy_(self.parameters_of(machine.nominal.expand(len(every), -1), every))
@@ -148,20 +148,9 @@ class SetUps(Mechanism):
         """The machine in the first set-up, of parameters `K`."""
         return self.machine.with_nominal(self.of_rows(torch.zeros(()), parameters))
 
-    def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As of an arm, each row in its set-up."""
-        assert isinstance(self.machine, SerialArm)
-        return self.machine.forward_frame(joints[..., :-1], self.of_rows(joints[..., -1], parameters))
-
-    def forward_kinematics(
-        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
-    ) -> Tensor:
-        """As of the machine, each row in its set-up."""
-        return self.machine.forward_kinematics(joints[..., :-1], self.of_rows(joints[..., -1], parameters), guess)
-
-    def frame(self, pose: Tensor) -> Frame:
-        """As of the machine."""
-        return self.machine.frame(pose)
+    def inside(self, joints: Tensor, parameters: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Joints of the machine, and the parameters of each row's set-up."""
+        return joints[..., :-1], self.of_rows(joints[..., -1], parameters)
 
 
 def set_ups(

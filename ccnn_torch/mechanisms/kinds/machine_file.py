@@ -26,7 +26,7 @@ from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import hint
 from ccnn_torch.units import LARGEST, amount, si_unit_of
 
 _FOLDER = Path(__file__).parent
@@ -97,9 +97,7 @@ def build_machine(content: Mapping[str, Any], where: str, makers: Mapping[str, C
 def _check_names(names: list[str], known: list[str], start: str) -> None:
     for name in names:
         if name not in known:
-            near = nearest(name, known)
-            hint = f"did you mean '{near}'? " if near else ""
-            raise InputError(f"{start} '{visible(name)}' is not known; {hint}there are {', '.join(known)}")
+            raise InputError(f"{start} '{visible(name)}' is not known; {hint(name, known)}")
 
 
 def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: Any) -> Mechanism:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -136,20 +137,27 @@ def parallel_to_next(convention: str, links: Sequence[Sequence[float]], groups: 
     return [i + 1 for i in sorted(near | told)]
 
 
+MOUNT = ({"alpha": "NPAE", "theta": "IA"}, {"d": "CA", "theta": "IE"})
+"""What astronomers call the parameters of the two links of a mount: axes that are not square, zero of the first joint,
+collimation (over the length of the tube), zero of the second joint."""
+
+
 def links_and_drives(
     convention: str,
     links: Sequence[Sequence[float]],
     joint_units: Sequence[str],
     drives: Sequence[Sequence[int]],
     leans: Sequence[Sequence[float]],
+    directions: bool,
 ) -> list[Parameter]:
-    """Parameters of the links, then of their leans, then of the drives."""
+    """Parameters of the links, then of their leans, then of the drives; directions: whether it only points."""
     _, names, units, _ = LINKS[convention]
+    senses = [{"theta": f"zero of joint {i}"} if unit == "rad" else {} for i, unit in enumerate(joint_units, 1)]
     found = []
-    for i, row in enumerate(links):
-        zero = {"theta": f"zero of joint {i + 1}"} if joint_units[i] == "rad" else {}
+    for i, (row, usual) in enumerate(zip(links, senses, strict=True)):
+        sense = MOUNT[i] if directions and len(links) == len(MOUNT) else usual
         found += [
-            Parameter(f"{p}{i + 1}", u, v, sense=zero.get(p, "")) for p, u, v in zip(names, units, row, strict=True)
+            Parameter(f"{p}{i + 1}", u, v, sense=sense.get(p, "")) for p, u, v in zip(names, units, row, strict=True)
         ]
     for link, lean in leans:
         i = int(link)
@@ -159,6 +167,16 @@ def links_and_drives(
         to, by = joint_units[i - 1], joint_units[j - 1]
         found.append(Parameter(f"drive{i}{j}", "1" if to == by else f"{to}/{by}", 0.0, scale=_DRIVE))
     return found
+
+
+def start_and_shares(own: Sequence[Parameter], numbers: Sequence[Mapping[str, Any]]) -> tuple[Tensor, Tensor]:
+    """Parameters `l` without the numbers [SI], and what one unit of each number adds to them, `k x l`."""
+    names = [p.name for p in own]
+    shares = torch.zeros(len(numbers), len(own), dtype=torch.float64)
+    for row, number in zip(shares, numbers, strict=True):
+        for name, share in number["of"].items():
+            row[names.index(name)] = share
+    return torch.tensor([p.nominal for p in own], dtype=torch.float64), shares
 
 
 def counting(convention: str, count: int, directions: bool) -> Tensor:

@@ -192,19 +192,27 @@ def _untilt(tilt: Tensor) -> Tensor:
 
 def _cranks(position: Tensor, rotation: Tensor, common: Tensor, limbs: Tensor) -> Tensor:
     """Angles β of the limbs' cranks by eq. 13, `... x j` [rad]; limbs: `... x j x 11`, from limb 1 on."""
-    a, _, l, h_s = (c[..., None] for c in common.unbind(-1))
-    dbx, dby, dbz, alpha, gamma, dl1, dl2, dax, day, daz, _ = limbs.unbind(-1)
-    turns = _turns(limbs.shape[-2])
-    # λ = B_j - r' - R A_j in the axes of the limb, as the appendix has it but for the turn by 90° from limb to limb.
-    on_platform = (turns @ stack_last(a + dax, day, daz - h_s)[..., None])[..., 0]
-    joint = position[..., None, :] + (rotation[..., None, :, :] @ on_platform[..., None])[..., 0]
-    gap = stack_last(a + dbx, dby, dbz) - (turns.mT @ joint[..., None])[..., 0]
+    gap, _, lower, upper, (sa, ca, sg, cg) = _limbs(position, rotation, common, limbs)
     x, y, z = gap.unbind(-1)
-    lower, upper = l + dl1, l + dl2
-    sa, ca, sg, cg = torch.sin(alpha), torch.cos(alpha), torch.sin(gamma), torch.cos(gamma)
     cosine = 2 * lower * (x * cg + y * ca * sg + z * sa * sg)
     sine = 2 * lower * (y * sa - z * ca)
     return crank_angle(cosine, sine, lower**2 + (gap**2).sum(-1) - upper**2, -1.0)
+
+
+def _limbs(
+    position: Tensor, rotation: Tensor, common: Tensor, limbs: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
+    """Of each limb, in its own axes: λ = B_j - r' - R A_j, as the appendix has it but for the turn by 90° from limb to
+    limb, `... x j x 3`; the axis of the R joint on the platform, likewise; the lengths of lower and upper link; and
+    sine and cosine of δα and of δγ."""
+    a, _, l, h_s = (c[..., None] for c in common.unbind(-1))
+    dbx, dby, dbz, alpha, gamma, dl1, dl2, dax, day, daz, _ = limbs.unbind(-1)
+    turns = _turns(limbs.shape[-2])
+    platform = turns.mT @ rotation[..., None, :, :] @ turns
+    joint = turns.mT @ position[..., None, :, None] + platform @ stack_last(a + dax, day, daz - h_s)[..., None]
+    gap = stack_last(a + dbx, dby, dbz) - joint[..., 0]
+    leans = torch.sin(alpha), torch.cos(alpha), torch.sin(gamma), torch.cos(gamma)
+    return gap, platform[..., :, 1], l + dl1, l + dl2, leans
 
 
 def _misfits(frame: Tensor, joints: Tensor, values: Tensor) -> Tensor:
@@ -217,20 +225,14 @@ def _misfits(frame: Tensor, joints: Tensor, values: Tensor) -> Tensor:
     active = joints + errors[..., -1]
     lead = torch.broadcast_shapes(passive.shape, active.shape)  # type: ignore[no-untyped-call]
     crank = torch.cat([active.expand(lead), passive.expand(lead)], dim=-1)
-    a, _, l, h_s = (c[..., None] for c in common.unbind(-1))
-    dbx, dby, dbz, alpha, gamma, dl1, dl2, dax, day, daz, _ = limbs.unbind(-1)
-    turns = _turns(4)
-    sa, ca, sg, cg = torch.sin(alpha), torch.cos(alpha), torch.sin(gamma), torch.cos(gamma)
+    gap, axis, lower, upper, (sa, ca, sg, cg) = _limbs(position, rotation, common, limbs)
     sb, cb = torch.sin(crank), torch.cos(crank)
     # w'_1 = Rx(δα) Rz(δγ) Ry(β) e1, whose products with λ are the appendix's A and B.
     along = stack_last(cb * cg, cb * ca * sg + sb * sa, cb * sa * sg - sb * ca)
-    elbow = stack_last(a + dbx, dby, dbz) + (l + dl1)[..., None] * along
-    on_platform = rotation[..., None, :, :] @ turns
-    joint = position[..., None, :] + (on_platform @ stack_last(a + dax, day, daz - h_s)[..., None])[..., 0]
-    link = joint - (turns @ elbow[..., None])[..., 0]
-    upper = (l + dl2)[..., :2]
+    link = gap + lower[..., None] * along
+    upper = upper[..., :2]
     length = ((link[..., :2, :] ** 2).sum(-1) - upper**2) / (2 * upper)
-    square = (link * on_platform[..., :, 1]).sum(-1)
+    square = -(link * axis).sum(-1)
     arm = position - values[..., 3, None] * rotation[..., :, 2]
     reach = ((arm**2).sum(-1) - values[..., 1] ** 2) / (2 * values[..., 1])
     held = square[..., 2] + square[..., 3]

@@ -15,6 +15,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.branches import commanded_joints
+from ccnn_torch.mechanisms.closest import Closest
 from ccnn_torch.mechanisms.machines.drives import Drives
 from ccnn_torch.mechanisms.machines.links import (
     LINKS,
@@ -26,11 +27,10 @@ from ccnn_torch.mechanisms.machines.links import (
     lean_screws,
     links_and_drives,
     parallel_to_next,
+    start_and_shares,
 )
-from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.mechanisms.newton import carry_derivative, nearest
-from ccnn_torch.mechanisms.pose import frame_gap
-from ccnn_torch.numerics.batching import expand_leading, stack_last
+from ccnn_torch.mechanisms.pose import Frame
+from ccnn_torch.numerics.batching import stack_last
 from ccnn_torch.numerics.rotations import (
     matrix_to_euler_zyx,
     matrix_to_rotation_vector,
@@ -39,36 +39,20 @@ from ccnn_torch.numerics.rotations import (
     skew,
 )
 
-
-def _start_and_shares(own: Sequence[Parameter], numbers: Sequence[Mapping[str, Any]]) -> tuple[Tensor, Tensor]:
-    """Parameters `l` without the numbers [SI], and what one unit of each number adds to them, `k x l`."""
-    names = [p.name for p in own]
-    shares = torch.zeros(len(numbers), len(own), dtype=torch.float64)
-    for row, number in zip(shares, numbers, strict=True):
-        for name, share in number["of"].items():
-            row[names.index(name)] = share
-    return torch.tensor([p.nominal for p in own], dtype=torch.float64), shares
-
-
 MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
-
-MOUNT = ({"alpha": "NPAE", "theta": "IA"}, {"d": "CA", "theta": "IE"})
-"""What astronomers call the parameters of the two links of a mount: axes that are not square, zero of the first joint,
-collimation (over the length of the tube), zero of the second joint."""
 
 FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
 
-class SerialArm(Mechanism):
+class SerialArm(Closest):
     """base · link 1 · … · link n · tool; pose x, y, z [m] and rotation vector rx, ry, rz [rad] in the record's frame.
 
     Parameters in order: the base frame (6: position, rotation vector), each link's (DH: a, alpha, d, theta; URDF: x, y,
     z, roll, pitch, yaw), those of leans and of drives, the tool frame (6). With `numbers` these stand in the place of
     those of links and drives: each adds to some of them, so that the links are linear in what people know of the
     machine.
-    `solve_inverse` is damped Newton to the closest pose in (position, rotation_weight x rotation vector), from `guess`:
-    for records the guess is the commanded joints.
+    For records the guess of `solve_inverse` is the commanded joints.
 
     Attributes:
         unknown_frames: those of "base" and "tool" that must be fitted to records first (`frames.fit_frames`).
@@ -157,11 +141,8 @@ class SerialArm(Mechanism):
         pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
         geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(FRAME, base, strict=True)]
         joint_units = ["rad" if t == "revolute" else "m" for t in types]
-        own = links_and_drives(convention, links, joint_units, drives, leans)
-        if orientation == "direction" and n == len(MOUNT):
-            named = {f"{p}{i}": sense for i, senses in enumerate(MOUNT, 1) for p, sense in senses.items()}
-            own = [replace(p, sense=named.get(p.name, "")) for p in own]
-        start, shares = _start_and_shares(own, numbers)
+        own = links_and_drives(convention, links, joint_units, drives, leans, orientation == "direction")
+        start, shares = start_and_shares(own, numbers)
         if numbers:
             own = [Parameter(**{k: v for k, v in number.items() if k != "of"}) for number in numbers]
             geometry = [replace(p, held="base" not in unknown) for p in geometry]
@@ -309,10 +290,6 @@ class SerialArm(Mechanism):
         draw = torch.rand(count, len(self.joints), generator=generator, dtype=torch.float64)
         return self.limits[:, 0] + (self.limits[:, 1] - self.limits[:, 0]) * draw
 
-    def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
-        """Poses of joints that are uniform within their limits, `count x p` [SI]."""
-        return self.forward_kinematics(self.sample_joints(count, generator))
-
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Positions no farther from the base than the reach: necessary, not sufficient; `...`, bool."""
         values = self.resolve(parameters)
@@ -415,6 +392,9 @@ class SerialArm(Mechanism):
             return position
         return torch.cat([position, matrix_to_rotation_vector(rotation)], dim=-1)
 
+    def _frame_at(self, joints: Tensor, values: Tensor, rows: Tensor) -> Frame:
+        return self.forward_frame(joints, values)
+
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Geometric Jacobian, closed form; see `Mechanism.jacobian`."""
         values = self.resolve(parameters)
@@ -483,52 +463,3 @@ class SerialArm(Mechanism):
             return rows
         spins = torch.cat([none, base_rate.expand(*lead, 3, 3), angular, none, whole @ tool_rate], -1)
         return torch.cat([rows, spins], -2)
-
-    def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Position difference [m] and rotation vector [rad] from the pose to the arm's, `... x 6` (or `... x 3`)."""
-        return frame_gap(self.forward_frame(joints, parameters), self.frame(pose), 1.0)
-
-    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
-        """Joints of the closest pose, as `nearest_joints`. Never NaN: `pose_error` gives the distance that remains."""
-        x = self.nearest_joints(pose, parameters, guess, self.rotation_weight)
-        values = self.resolve(parameters)
-        slope = self.jacobian(x, values.detach()) * self._weights(self.rotation_weight)
-        return carry_derivative(
-            x, slope, frame_gap(self.forward_frame(x, values), self.frame(pose), self.rotation_weight)
-        )
-
-    def nearest_joints(
-        self,
-        pose: Tensor,
-        parameters: Tensor | None,
-        guess: Tensor | None,
-        rotation_weight: float,
-        damping: float = 0.0,
-    ) -> Tensor:
-        """Joints whose pose is closest in (position, rotation_weight x rotation vector), by damped Newton from `guess`.
-
-        Where joints are more than pose coordinates (redundant arms, poses without orientation) the deviation from the
-        guess has the least norm. With `damping` [m per joint unit] the squared deviation times damping² is part of what
-        is minimised, which bounds it near singularities. No gradient flows through this; it does through
-        `solve_inverse`.
-        """
-        values = self.resolve(parameters)
-        position, rotation = self.frame(pose)
-        parts = (position,) if rotation is None else (position, rotation.flatten(-2))
-        anchor = expand_leading(self.home_joints if guess is None else guess, position, values).detach()
-        weights = self._weights(rotation_weight)
-
-        def gap(q: Tensor, v: Tensor, x: Tensor, *turn: Tensor) -> Tensor:
-            here = x, turn[0].reshape(*x.shape, 3) if turn else None
-            return frame_gap(self.forward_frame(q, v), here, rotation_weight)
-
-        redundant = len(self.joints) > len(weights)
-        return nearest(
-            gap, lambda q, v, *_: self.jacobian(q, v) * weights, anchor, (values, *parts), damping, redundant
-        )
-
-    def _weights(self, rotation_weight: float) -> Tensor:
-        """Weights of the rows of the Jacobian, `6 x 1` or `3 x 1`."""
-        column = torch.ones(6, 1, dtype=torch.float64)
-        column[3:] = rotation_weight
-        return column if self.orientation == "rotation_vector" else column[:3]

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Condition, Coordinate, plausible_error
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.mechanism import Mechanism, drawn_within
+from ccnn_torch.mechanisms.closest import Closest
+from ccnn_torch.mechanisms.mechanism import drawn_within
 from ccnn_torch.mechanisms.newton import carry_derivative
 from ccnn_torch.mechanisms.pose import Frame, frame_from_coordinates, frame_gap, frame_jacobian
 from ccnn_torch.mechanisms.simulators.simulator import Calls, Simulator, described, try_simulator
@@ -123,12 +124,12 @@ class _Slope(torch.autograd.Function):
 _STARTS = 256
 # Of a machine as built: a parameter is moved by this share of its plausible error.
 _SHARE = 0.1
-# Rotation against position in the search for a pose [m/rad]; how far a pose may be missed [m].
-_WEIGHT, _MISSED = 0.04, 1e-7
+# How far a pose may be missed [m].
+_MISSED = 1e-7
 _SETTLED = 1e-10
 
 
-class BlackBox(Mechanism):
+class BlackBox(Closest):
     """A `Simulator` in the place of closed forms.
 
     It differentiates in joints and parameters (first derivatives, by differences; not in covariates). Where it has
@@ -254,16 +255,12 @@ class BlackBox(Mechanism):
         point = values.detach().expand(*leading_shape(joints, values), -1)
         return central_slope(self, lambda v: self._calls.pose(joints, v, self.conditions), point, step, places, bounds)
 
-    def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 3` or `6`."""
-        return frame_gap(self.frame(self.forward_kinematics(joints, parameters)), self.frame(pose), 1.0)
-
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Joints by damped Newton from the nearest of some hundred configurations, or from the guess.
 
         NaN where the pose is missed by more than 1e-7 m, unless there are fewer joints than pose coordinates.
         """
-        return self.nearest_joints(pose, parameters, guess, _WEIGHT)
+        return self.nearest_joints(pose, parameters, guess, self.rotation_weight)
 
     def nearest_joints(
         self,
@@ -331,10 +328,6 @@ class BlackBox(Mechanism):
             lambda joints: torch.isfinite(self.forward_kinematics(joints)).all(-1),
             wrong,
         )
-
-    def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
-        """Poses of sampled commands, `count x p` [SI]; uniform in the joints."""
-        return self.forward_kinematics(self.sample_joints(count, generator))
 
     def _own_file(self) -> dict[str, Any]:
         raise InputError(
