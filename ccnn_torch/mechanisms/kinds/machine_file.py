@@ -245,7 +245,7 @@ def _numbers(
     for text, own in zip(texts, usual, strict=True):
         value, *tolerance = _TOLERANCE.split(str(text)) if text is not None else [None]
         # A tolerance alone is of the place as drawn.
-        if tolerance and not value.strip() and "value" not in entry:
+        if tolerance and not value and "value" not in entry:
             value = None
         if len(tolerance) > 1:
             raise InputError(
