@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.joint_fit import JointFit, effects_that_pay, fit_jointly
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, reached
+from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 NOISE = 2e-5
@@ -122,3 +123,22 @@ def test_rows_that_are_not_used_change_nothing() -> None:
     first = fit_jointly(situation, pose, [], used, range(48)).parameters
     pose[110] += 1.0
     torch.testing.assert_close(fit_jointly(situation, pose, [], used, range(48)).parameters, first, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("turning", [range(6), range(1)], ids=["all legs", "one leg"])
+def test_screws_of_legs_turn_alike_unless_the_rows_say_otherwise(turning: range) -> None:
+    """Waves that no leg shows by itself all legs show together; one screw that is worn is no fault of the others."""
+    mechanism, drawn = load_mechanism("stewart"), torch.Generator().manual_seed(4)
+    joints = mechanism.solve_inverse(mechanism.sample_workspace(50, drawn))
+    situation, effect = Situation(mechanism, joints, {}, default_gravity(mechanism)), make_effect("transmission")
+    size = 1.6e-5 if len(turning) > 1 else 6e-5
+    values = torch.tensor(
+        [size * (c.name in {f"q{i + 1} sin" for i in turning}) for c in effect.coefficients(situation)]
+    )
+    cause = Acting(effect, torch.full((6,), 2 * torch.pi / 5e-3, dtype=torch.float64), values.double())
+    pose = reached(situation, [cause])
+    pose = pose + NOISE * torch.randn(pose.shape, generator=drawn, dtype=torch.float64)
+    (found,) = effects_that_pay(situation, pose, [effect], torch.ones(50) > 0, [])
+    assert {*range(8 * len(turning))} <= {*found.used} and (len(found.used) == 48) == (len(turning) == 6)
+    periods = found.shape[list(turning)] * 5e-3 / (2 * torch.pi)
+    assert float(periods.max()) == float(periods.min()) and min(abs(float(periods[0]) - k) for k in (0.5, 1.0)) < 0.01

@@ -150,18 +150,25 @@ class Transmission(OfJoints):
         )
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """The frequency of each joint's error: whole numbers a turn, or from 1.5 periods over the travel upward."""
-        low, high = (edge.tolist() for edge in situation.workspace)
-        count = len(_HARMONICS)
+        """The frequency of each joint's error: whole numbers a turn, or from 1.5 periods over the travel upward.
+
+        The drives of a machine's legs are made alike.
+        """
+        low, high = situation.workspace
+        travels, joints, count = (high - low).tolist(), situation.mechanism.joints, len(_HARMONICS)
+        alike = any(p.leg is not None for p in situation.mechanism.geometry)
+        if alike:
+            travels = [max(t for t, other in zip(travels, joints, strict=True) if other.unit == j.unit) for j in joints]
         return tuple(
             Shape(
                 f"{j.name} frequency",
                 f"rad/{j.unit}" if j.unit != "rad" else "1",
-                _frequencies(j.unit, high[i] - low[i]),
+                _frequencies(j.unit, travels[i]),
                 tuple(range(count * i, count * (i + 1))),
                 refined=j.unit != "rad",
+                alike=j.unit if alike else "",
             )
-            for i, j in enumerate(situation.mechanism.joints)
+            for i, j in enumerate(joints)
         )
 
     def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:

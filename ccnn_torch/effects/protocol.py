@@ -55,6 +55,8 @@ class Shape:
             searched one by one.
         refined: whether values between those of the grid are possible.
         usual: what a simulation takes unless given; drawn from the lower half of the grid where None.
+        alike: shapes with one such text, and one grid, are of parts that are made alike, and likely have one value;
+            empty = it is like no other.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Shape:
     columns: tuple[int, ...] | None = None
     usual: float | None = None
     refined: bool = True
+    alike: str = ""
 
     @property
     def textbook(self) -> float | None:

@@ -148,6 +148,14 @@ def test_a_delta_printer_has_a_value_for_each_tower(tmp_path: Path) -> None:
     assert made.nominal[[p.name for p in made.geometry].index("rod1")] == pytest.approx(0.2504)
 
 
+def test_joints_of_a_hexapod_are_known_as_well_as_the_file_says(tmp_path: Path) -> None:
+    made = machine(tmp_path, "hexapod", base_x="+- 0.15 mm", platform_z="[+- 0.1 mm, ±0.2 mm, 1 mm, 2 mm, 3 mm, 4 mm]")
+    by_name, drawn = ({p.name: p for p in m.geometry} for m in (made, machine(tmp_path, "hexapod")))
+    assert by_name["B2x"].scale == pytest.approx(1.5e-4) and by_name["B2x"].nominal == drawn["B2x"].nominal
+    assert [by_name[f"P{i}z"].scale for i in (1, 2, 3)] == pytest.approx([1e-4, 2e-4, 3e-4])
+    assert by_name["P3z"].nominal == pytest.approx(1e-3) and by_name["B2y"].scale == pytest.approx(3e-4)
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [
@@ -160,6 +168,7 @@ def test_a_delta_printer_has_a_value_for_each_tower(tmp_path: Path) -> None:
         ("machine: gantry\nnumbers: {lead_x: .inf}", "must be a finite number"),
         ("machine: delta_printer\nnumbers: {arm_length: 250}", "'250' has no unit; write 250 mm"),
         ("machine: gantry\nnumbers: {lead_x: 0 um/m +- 3e2}", "'3e2' has no unit; write 3e2 um/m"),
+        ("machine: hexapod\nnumbers: {L: +- 1 mm}", "numbers.L: '' is no number"),
         ("machine: gantry\nlimits: 3", "limits: must be as"),
         ("machine: gantry\nnumbers: 3", "must have lines such as"),
         ("machine: gantry\ntool_fram: identity", "the key 'tool_fram' is not known; did you mean 'tool_frame'"),

@@ -36,7 +36,8 @@ NESTS = np.array([[0.14, 0.0, 0.03], [-0.07, 0.12, 0.03], [-0.07, -0.12, 0.06]])
 TRAVEL = np.array([0.05, 0.05, 0.025, 0.17, 0.17, 0.25])
 MACHINE = """machine: hexapod
 numbers: {base_radius: 280 mm, platform_radius: 160 mm, base_spread: 12 deg, platform_spread: 12 deg, height: 420 mm,
-  L: 0 mm +- 0.3 mm, lead: 1 +- 0.0003}
+  L: 0 mm +- 0.3 mm, lead: 1 +- 0.0003, base_x: +- 0.15 mm, base_y: +- 0.15 mm, base_z: +- 0.15 mm,
+  platform_x: +- 0.15 mm, platform_y: +- 0.15 mm, platform_z: +- 0.15 mm}
 """
 CONFIG = "mechanism: framed\nmechanism_keys: {base: true, tool: true, mechanism: "
 DRAWING = "{base_radius: 0.28, platform_radius: 0.16, base_spread: 0.2094395, platform_spread: 0.2094395, height: 0.42}"

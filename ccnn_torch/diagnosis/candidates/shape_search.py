@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -65,10 +66,16 @@ class _Factored(Protocol):
 
 
 class _Part(NamedTuple):
-    """Shapes that share coefficients, and which those are."""
+    """Shapes that share coefficients, and which those are; tied: whether the shapes have one value."""
 
     shapes: list[int]
     columns: list[int]
+    tied: bool = False
+
+    @property
+    def one(self) -> bool:
+        """Whether there is one value to be searched."""
+        return self.tied or len(self.shapes) == 1
 
 
 class _Turn(NamedTuple):
@@ -129,6 +136,12 @@ class Scan:
         self.unshaped = self._whitened(first[:1], free, None)[0]
         self.coarse: list[_Turn] | None = None
         self.leads: dict[tuple[int, ...], SharedColumns] = {}
+        # The same where parts that are made alike have one value.
+        self.tied: Scan | None = None
+        tied = _tied(self.shapes, self.parts)
+        if len(tied) < len(self.parts):
+            self.tied = copy(self)
+            self.tied.parts = tied
 
     def columns(self, candidates: Tensor, rows: Tensor | None) -> list[TrialColumns]:
         """Of each part, whitened, in plausible sizes; candidates: `g x h`; rows: which, None = all."""
@@ -180,13 +193,24 @@ class Scan:
         return mine.mul_(_of(self.white.scale, rows, 0)[..., None]).nan_to_num_()
 
     def best(self, ground: SearchRows, start: Tensor | None = None) -> Shaped:
-        """The shapes that explain most.
+        """The shapes that explain most; of parts that are made alike one for all, where that is more probable.
 
         Args:
             ground: what is to be explained, and beside what.
             start: shapes found before, when the effect is known to be there: its parts are then searched beside each
                 other.
         """
+        found = [scan._searched(ground, start) for scan in (self, self.tied) if scan is not None]
+        return max(found, key=lambda one: self._log_odds(ground, one)) if len(found) > 1 else found[0]
+
+    def _log_odds(self, ground: SearchRows, found: Shaped) -> float:
+        """Log evidence of the columns at the shapes found, less the charge."""
+        used = [*range(len(self.size))] if found.used is None else [*found.used]
+        basis = _of(self._basis(found.value[None]), ground.rows, 1)
+        tried = TrialColumns(self._whitened(basis, used, ground.rows))
+        return ground.times * float(ground.left.log_evidence(tried, torch.arange(1))) - found.charge
+
+    def _searched(self, ground: SearchRows, start: Tensor | None) -> Shaped:
         value = self.start if start is None else start
         gains = [0.0] * len(self.parts)
         charges = [0.0] * len(self.parts)
@@ -216,7 +240,7 @@ class Scan:
                             likely = score if level == 1 else left.log_evidence(tried, torch.arange(len(score)))
                             about = _tops(score, likely)
                             chosen[i] = int(about[likely[about].argmax()])
-                        if len(self.parts[i].shapes) == 1:
+                        if self.parts[i].one:
                             peaks[i] = candidates[about, self.parts[i].shapes[0]]
                         gains[i] = float(score[chosen[i]])
                         if level == 0:
@@ -261,9 +285,12 @@ class Scan:
 
     def _tables(self, value: Tensor, part: _Part, level: int, peaks: Tensor | None) -> list[Tensor]:
         """Values to look at, one table a turn, `g x (shapes of the part)`."""
-        grids = [self._grid(h, float(value[h]), level) for h in part.shapes]
+        grids = [self._grid(h, float(value[h]), level) for h in (part.shapes[:1] if part.one else part.shapes)]
         if peaks is not None:
             grids = [torch.cat([self._grid(part.shapes[0], float(peak), level) for peak in peaks])]
+        if part.tied:
+            refined = not level or self.shapes[part.shapes[0]].refined
+            return [grids[0][:, None].expand(-1, len(part.shapes))] * refined
         if len(grids) > 1 and level == 0 and math.prod(map(len, grids)) <= _TOGETHER:
             return [torch.cartesian_prod(*grids)]
         found = []
@@ -366,3 +393,16 @@ def _parts(shapes: tuple[Shape, ...], coefficients: int) -> list[_Part]:
         members = sorted({h, *(k for p in joined for k in p.shapes)})
         parts.append(_Part(members, sorted(mine.union(*(p.columns for p in joined)))))
     return parts
+
+
+def _tied(shapes: tuple[Shape, ...], parts: list[_Part]) -> list[_Part]:
+    """Parts of one shape each that are made alike as one, the others as they are."""
+    found: dict[tuple[str, tuple[float, ...]] | int, _Part] = {}
+    for i, part in enumerate(parts):
+        first = shapes[part.shapes[0]]
+        key = (first.alike, first.grid) if first.alike and part.one else i
+        before = found.get(key)
+        if before is not None:
+            part = _Part(before.shapes + part.shapes, sorted(before.columns + part.columns), True)
+        found[key] = part
+    return [*found.values()]

@@ -242,6 +242,9 @@ def _numbers(
     found = []
     for text, own in zip(texts, usual, strict=True):
         value, *tolerance = _TOLERANCE.split(str(text)) if text is not None else [None]
+        # A tolerance alone is of the place as drawn.
+        if tolerance and not value and "value" not in entry:
+            value = None
         if len(tolerance) > 1:
             raise InputError(
                 f"{where}: numbers.{key}: '{visible(str(text))}' has two tolerances; write 250 mm +- 0.5 mm"
@@ -311,9 +314,8 @@ def template(kind: str) -> str:
         "numbers:",
     ]
     for key, entry in {**about.get("keys", {}), **about["numbers"]}.items():
-        if "value" in entry:
-            said = f"   # {entry['about']}" if "about" in entry else ""
-            lines.append(f"  {key}: {_written(entry['value'], entry.get('tolerance'))}{said}")
+        said = f"   # {entry['about']}" if "about" in entry else ""
+        lines.append(f"  {key}: {_written(entry.get('value', ''), entry.get('tolerance')).strip()}{said}")
     return "\n".join(lines) + "\n"
 
 
