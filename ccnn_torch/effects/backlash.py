@@ -20,8 +20,8 @@ _SCALE = {"m": 1.5e-4, "rad": 2e-4}
 _HOLDS = (0.0, 0.1, 0.2, 0.4, 0.7, 1.2, 2.0, 3.5, 6.0, 60.0)
 # Where no direction is known: beyond them a change is in proportion to the load.
 _LOOSE = _HOLDS[1:3]
-_SOFT = 0.3
-_EDGES = ((" softer", 2 * _SOFT), (" harder", 0.5 * _SOFT))
+_SOFT, _WIDTH = 0.3, 1.0
+_EDGES = ((" softer", 4 * _SOFT), (" harder", 0.5 * _SOFT))
 
 
 class Backlash(OfJoints):
@@ -79,8 +79,10 @@ class Backlash(OfJoints):
         weight = shape[..., 0] if situation.loaded else shape.new_tensor(PLATFORM_WEIGHT)
         hold = shape[..., -1, None, None]
         # A joint that friction does not hold at all changes its flank as softly as one that it hardly holds.
-        unit = hold.clamp_min(_HOLDS[1])
-        left = (situation.push(weight, rows) - hold * of_rows(situation.direction, rows)) / unit
+        unit = hold.clamp_min(_WIDTH)
+        # What friction holds against any push rests as it came, at whatever edge.
+        push = torch.where(hold < _HOLDS[-1], situation.push(weight, rows), 0.0)
+        left = (push - hold * of_rows(situation.direction, rows)) / unit
         rest = _rest(left, _SOFT)
         edges = [_rest(left, soft) - rest for _, soft in _EDGES]
         return torch.stack([rest, *edges], -1)
