@@ -36,8 +36,8 @@ class Backlash(OfJoints):
 
     A joint rests on the flank that drove it, half the backlash b behind the motor's middle, unless weight and load push
     it onto the other flank whichever way it came; friction holds it there up to the push h. The machine's weight and h
-    are shapes, h for all joints alike; where h is above 1 and no push reaches it this is -b s / 2. Secondary: the same with
-    an edge four times and half as soft as e = 0.3, less the part with e, so that b stays the backlash.
+    are shapes, h for all joints alike; where h is above 1 and no push reaches it this is -b s / 2. Secondary: the same
+    with an edge four times and half as soft as e = 0.3, less the part with e, so that b stays the backlash.
     """
 
     name = "backlash"
