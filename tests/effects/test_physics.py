@@ -242,6 +242,20 @@ def test_play_is_the_way_between_both_sides_of_approach() -> None:
     assert torch.allclose(ends[1] - ends[0], torch.tensor([3e-4, 0.0], dtype=torch.float64).expand(9, 2), atol=1e-7)
     names = [c.name for c in make_effect("backlash").coefficients(side)]
     assert names == ["q1", "q1 softer", "q1 harder"]  # nothing is known of the other joint's side
+    # Where friction holds against any push, no edge stands for what grows with it.
+    soft = acting("backlash", side, q1_softer=0.1, q1_harder=0.1, hold=60.0)
+    assert bool((soft.change(side) == 0).all())
+
+
+def test_a_gear_of_little_friction_goes_from_flank_to_flank_over_a_range_of_torque() -> None:
+    rows = situation("tripod")
+    light = torch.linspace(-40, 40, 9, dtype=torch.float64)
+    columns = {f"direction{i}": torch.ones(9, dtype=torch.float64) for i in (1, 2, 3)}
+    loaded = replace(rows, covariates={**columns, "load_z": light})
+    rest = acting("backlash", loaded, q1=2e-4, hold=0.1, weight=0.0).change(loaded)[:, 0]
+    push = loaded.push(torch.zeros((), dtype=torch.float64))[:, 0]
+    # Lost motion: its slope is that of a spring where little pushes the gear, however small its friction.
+    assert torch.allclose(rest, 1e-4 * torch.tanh((push - 0.1) / 0.3) / math.tanh(1 / 0.3))
 
 
 def test_friction_acts_against_the_last_motion_and_grows_with_the_load() -> None:
