@@ -21,23 +21,19 @@ _HOLDS = (0.0, 0.1, 0.2, 0.4, 0.7, 1.2, 2.0, 3.5, 6.0, 60.0)
 # Where no direction is known: beyond them a change is in proportion to the load.
 _LOOSE = _HOLDS[1:3]
 _SOFT = 0.3
-# A gear turns from flank to flank over torques that are no smaller where it has little friction: its lost motion. In
-# units of the usual push, times the softness.
-_WIDTH = 1.0
-_EDGES = ((" softer", 4 * _SOFT), (" harder", 0.5 * _SOFT))
+_EDGES = ((" softer", 2 * _SOFT), (" harder", 0.5 * _SOFT))
 
 
 class Backlash(OfJoints):
-    """Δq_i = b_i / 2 tanh((w_i - s_i h) / e max(h, 1)) / tanh(1 / e): s the direction of approach, w the push on the
-    joint, in units of what a platform of 100 N usually asks of it.
+    """Δq_i = b_i / 2 tanh((w_i / h - s_i) / e) / tanh(1 / e): s the direction of approach, w the push on the joint.
 
-    Without any direction s is 0, and 0.1 or 0.2 stands for max(h, 1): a load throws the joint from one flank to the
-    other, as it does one whose bolt or bearing is loose.
+    Without any direction s is 0, and h so small that a load throws the joint from one flank to the other, as it does
+    one whose bolt or bearing is loose.
 
     A joint rests on the flank that drove it, half the backlash b behind the motor's middle, unless weight and load push
     it onto the other flank whichever way it came; friction holds it there up to the push h. The machine's weight and h
-    are shapes, h for all joints alike; where h is above 1 and no push reaches it this is -b s / 2. Secondary: the same
-    with an edge four times and half as soft as e = 0.3, less the part with e, so that b stays the backlash.
+    are shapes, h for all joints alike; without a push that reaches h this is -b s / 2. Secondary: the same with an edge
+    twice and half as soft as e = 0.3, less the part with e, so that b stays the backlash.
     """
 
     name = "backlash"
@@ -82,7 +78,8 @@ class Backlash(OfJoints):
         """Where each joint rests, and what other edges change of that."""
         weight = shape[..., 0] if situation.loaded else shape.new_tensor(PLATFORM_WEIGHT)
         hold = shape[..., -1, None, None]
-        unit = hold.clamp_min(_WIDTH) if situation.directed else hold
+        # A joint that friction does not hold at all changes its flank as softly as one that it hardly holds.
+        unit = hold.clamp_min(_HOLDS[1])
         left = (situation.push(weight, rows) - hold * of_rows(situation.direction, rows)) / unit
         rest = _rest(left, _SOFT)
         # What friction holds against any push comes to no edge.

@@ -247,17 +247,6 @@ def test_play_is_the_way_between_both_sides_of_approach() -> None:
     assert bool((soft.change(side) == 0).all())
 
 
-def test_a_gear_of_little_friction_goes_from_flank_to_flank_over_a_range_of_torque() -> None:
-    rows = situation("tripod")
-    light = torch.linspace(-40, 40, 9, dtype=torch.float64)
-    columns = {f"direction{i}": torch.ones(9, dtype=torch.float64) for i in (1, 2, 3)}
-    loaded = replace(rows, covariates={**columns, "load_z": light})
-    rest = acting("backlash", loaded, q1=2e-4, hold=0.1, weight=0.0).change(loaded)[:, 0]
-    push = loaded.push(torch.zeros((), dtype=torch.float64))[:, 0]
-    # Lost motion: its slope is that of a spring where little pushes the gear, however small its friction.
-    assert torch.allclose(rest, 1e-4 * torch.tanh((push - 0.1) / 0.3) / math.tanh(1 / 0.3))
-
-
 def test_friction_acts_against_the_last_motion_and_grows_with_the_load() -> None:
     rows = situation("five_bar")
     change = acting("friction", rows, q2_load=2e-6).change(rows)
