@@ -259,7 +259,7 @@ def script_fit(command: Array, told: Array, plan: Array, seen: Array) -> tuple[A
         return np.asarray(there - place_of(angles, x[:15].reshape(5, 3), script_plate(x, told)))
 
     def residuals(u: Array) -> Array:
-        return np.r_[left(u).ravel() / 2e-5, u[:37], 0.01 * u[37:]]
+        return np.asarray(np.r_[left(u).ravel() / 2e-5, u[:37], 0.01 * u[37:]])
 
     found = least_squares(residuals, np.zeros(43), loss="soft_l1", f_scale=3.0)
     return EXPECTED + found.x[:37] * PRIOR, left(found.x)
