@@ -82,7 +82,8 @@ class Backlash(OfJoints):
         unit = hold.clamp_min(_HOLDS[1])
         left = (situation.push(weight, rows) - hold * of_rows(situation.direction, rows)) / unit
         rest = _rest(left, _SOFT)
-        edges = [_rest(left, soft) - rest for _, soft in _EDGES]
+        # What friction holds against any push comes to no edge.
+        edges = [(_rest(left, soft) - rest) * (hold < _HOLDS[-1]) for _, soft in _EDGES]
         return torch.stack([rest, *edges], -1)
 
 

@@ -242,6 +242,9 @@ def test_play_is_the_way_between_both_sides_of_approach() -> None:
     assert torch.allclose(ends[1] - ends[0], torch.tensor([3e-4, 0.0], dtype=torch.float64).expand(9, 2), atol=1e-7)
     names = [c.name for c in make_effect("backlash").coefficients(side)]
     assert names == ["q1", "q1 softer", "q1 harder"]  # nothing is known of the other joint's side
+    # Where friction holds against any push, no edge stands for what grows with it.
+    soft = acting("backlash", side, q1_softer=0.1, q1_harder=0.1, hold=60.0)
+    assert bool((soft.change(side) == 0).all())
 
 
 def test_friction_acts_against_the_last_motion_and_grows_with_the_load() -> None:

@@ -89,6 +89,16 @@ def test_delta_hangs_with_its_cranks_outward():
     torch.testing.assert_close(level, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-14)
 
 
+def test_a_delta_of_other_dimensions_is_sampled_where_it_works():
+    """Cranks from a little above level downwards; a picker has its platform 0.7 to 0.95 m below the motors."""
+    picker = load_mechanism("delta", base=0.2, crank=0.35, platform=0.06, rod=0.8)
+    level = picker.forward_kinematics(torch.zeros(3, dtype=torch.float64))[2]
+    joints = picker.sample_joints(200, torch.Generator().manual_seed(2))
+    assert picker.low[2] < -0.9 and picker.high[2] < level
+    assert joints.min() > -0.4 and joints.max() < 1.2
+    assert load_mechanism("delta").low.tolist() == [-0.15, -0.15, -0.6]
+
+
 def test_radii_of_a_delta_act_by_their_difference_only():
     for name in ("delta", "delta_linear"):
         delta = load_mechanism(name)

@@ -100,7 +100,13 @@ class Delta(_Parallelograms):
     """
 
     def __init__(self, base: float = 0.2, crank: float = 0.25, platform: float = 0.05, rod: float = 0.55) -> None:
-        """Radii of base and platform, lengths of cranks and rods [m]; the sampling box is x, y ±0.15, z -0.6..-0.4."""
+        """Radii of base and platform, lengths of cranks and rods [m].
+
+        The sampling box begins below where all cranks are level, and goes by their length: ±0.6 of it in x and y, 0.8
+        of it in z (by the default dimensions ±0.15 m, -0.6..-0.4 m).
+        """
+        level = math.sqrt(max(rod**2 - (base + crank - platform) ** 2, 0.0))
+        wide, top, bottom = (round(v, 3) for v in (0.6 * crank, -level - 0.09 * crank, -level - 0.89 * crank))
         super().__init__(
             name="delta",
             unit="rad",
@@ -112,8 +118,8 @@ class Delta(_Parallelograms):
                 ("rod", "m", rod),
                 ("offset", "rad", 0.0),
             ],
-            low=(-0.15, -0.15, -0.6),
-            high=(0.15, 0.15, -0.4),
+            low=(-wide, -wide, bottom),
+            high=(wide, wide, top),
             drives=_crank_ends,
         )
 
