@@ -248,7 +248,7 @@ class Structure:
         )
         # Networks that were done earlier made fewer iterations; this counts those of the last one.
         self.passes = self.passes.index_add(
-            0, index, torch.full_like(refined.error, refined.iterations * (outputs + 1))
+            0, index, torch.full_like(refined.log_evidence, refined.iterations * (outputs + 1))
         )
         found = refined.precisions
         found = found._replace(prior=resized_prior(found.prior, outputs, used, self.slots))
