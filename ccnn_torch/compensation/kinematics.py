@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation.expansions import ChebyshevExpansion
 from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import homogeneous, rotation_vector_to_matrix
 
 # Of central differences of the fourth order [SI]: machines are about 1 m, and their kinematics are curved by about 1/m.
 _STEP = 5e-4
@@ -322,7 +322,7 @@ def _links(arm: SerialArm) -> Tensor:
 
     def at(q: float) -> Tensor:
         joints = torch.full((len(arm.joints),), q, dtype=torch.float64)
-        return _homogeneous(*arm.link_transforms(joints, values))
+        return homogeneous(*arm.link_transforms(joints, values))
 
     zero, quarter, half = at(0.0), at(math.pi / 2), at(math.pi)
     turns = arm.revolute[:, None, None]
@@ -330,8 +330,8 @@ def _links(arm: SerialArm) -> Tensor:
     cosine = torch.where(turns, (zero - half) / 2, 0.0)
     other = torch.where(turns, quarter - constant, (half - zero) / math.pi)
     links = torch.stack([cosine, other, constant])
-    base = _homogeneous(rotation_vector_to_matrix(values[3:6]), values[:3])
-    tool = _homogeneous(rotation_vector_to_matrix(values[-3:]), values[-6:-3])
+    base = homogeneous(rotation_vector_to_matrix(values[3:6]), values[:3])
+    tool = homogeneous(rotation_vector_to_matrix(values[-3:]), values[-6:-3])
     links[:, 0] = base @ links[:, 0]
     links[:, -1] = links[:, -1] @ tool
     return torch.where(links.abs() < _NOTHING, 0.0, links)
@@ -346,10 +346,3 @@ def _screws(links: Tensor) -> tuple[Tensor, Tensor]:
     rate = torch.linalg.solve(links[0] + links[2], links[1])
     rate = torch.where(rate.abs() < _NOTHING, 0.0, rate)
     return skew_vector(rate[..., :3, :3])[..., None], rate[..., :3, 3:]
-
-
-def _homogeneous(rotation: Tensor, translation: Tensor) -> Tensor:
-    """`... x 4 x 4` of a rotation `... x 3 x 3` and a translation `... x 3`."""
-    whole = rotation.new_zeros(*rotation.shape[:-2], 4, 4)
-    whole[..., :3, :3], whole[..., :3, 3], whole[..., 3, 3] = rotation, translation, 1.0
-    return whole

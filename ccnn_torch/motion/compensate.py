@@ -54,8 +54,7 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
         refuse_time(table, rows, time[rows])
         if len(rows) < _FEWEST:
             raise InputError(f"{name}: {len(rows)} rows are no motion; give at least {_FEWEST}")
-        here = _of_rows(around, rows)
-        own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], here, found.errors)
+        own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], around.at(rows), found.errors)
         _refuse_absurd(model, name, found, wanted[rows], own.plain)
         command[rows], position[rows], plain[rows] = own.command, own.position, own.plain
     # What the model leaves stays, and adds to what the correction does.
@@ -64,8 +63,7 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
     if useless.any():
         command[:, useless] = wanted[:, useless]
         for _, rows in runs:
-            here = _of_rows(around, rows)
-            position[rows] = moved(found.nominal, found.axes, time[rows], command[rows][None], here)[0]
+            position[rows] = moved(found.nominal, found.axes, time[rows], command[rows][None], around.at(rows))[0]
         after = np.hypot(np.sqrt(np.square(wanted - position).mean(0)), found.left)
     added: dict[str, Array | list[str]] = {}
     for what, values in (("corrected", command), ("predicted", position)):
@@ -115,10 +113,6 @@ def _around(found: Identified, table: Table) -> tuple[Around, list[str]]:
     if warm is not None:
         warm = warm - (float(warm[0]) if found.temperature is None else found.temperature)
     return Around(supply, warm), said
-
-
-def _of_rows(around: Around, rows: NDArray[np.int64]) -> Around:
-    return Around(*(None if own is None else own[rows] for own in around))
 
 
 def _begun(name: str, time: Array, wanted: Array) -> list[str]:
