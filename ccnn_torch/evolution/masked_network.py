@@ -88,7 +88,7 @@ def spread_variance(
     """Predictive variance of every row, `... x s x o` [1].
 
     Args:
-        masks, weights: of the averaged network (`average`), one a layer, `... x out x in`.
+        masks, weights: of the averaged network (`averaged`), one a layer, `... x out x in`.
         inputs: `... x s x i` [1].
         waves: of the averaged network, `... x k`.
     """
