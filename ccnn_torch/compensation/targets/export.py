@@ -111,10 +111,8 @@ def _onnx(order: _Order) -> dict[str, bytes | str]:
 
 
 def _table(order: _Order, mesh: bool = True) -> dict[str, str]:
-    if order.model.machine is not None:
-        return print_tables(order.compensator(), order.model.machine.nominal, mesh)
     known = "spec" in order.model.facts["mechanism"]
-    return print_tables(order.compensator(), order.mechanism() if known else None, mesh)
+    return print_tables(order.compensator(), order.model.mechanism(order.allow_code) if known else None, mesh)
 
 
 def _ros2_control(order: _Order) -> Mapping[str, str]:
