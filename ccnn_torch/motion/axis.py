@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ccnn_torch.motion.compilable import is_compiled
 from ccnn_torch.motion.course import course, courses
-from ccnn_torch.motion.stage import ABSENT, TINY, Axis, Given, axis_of
+from ccnn_torch.motion.stage import ABSENT, TINY, Given, axis_of
 from ccnn_torch.motion.stretches import PLACES, START
 
 Array = NDArray[np.float64]
@@ -113,10 +113,10 @@ def simulate_axes(
         [np.interp(time[k] - d, time[k], command[j]) for k, j, d in zip(row, run, a.delay[own], strict=True)]
     )
     u, step = late * (1 + a.ratio[own, None]) + a.offset[own, None], np.diff(time)
-    found, axis = np.empty((len(run), s)), axis_of(a)
+    found = np.empty((len(run), s))
     for many in np.unique(parts):
         here = np.flatnonzero(parts == many)
-        some = Axis(*(v[own[here]] for v in axis))
+        some = axis_of(Given(*given[own[here]].T))
         has_any = Given(*has[own[here]].any(0).tolist())
         one, begin, bend, resists, volts, heat = (
             v[run[here] % len(v)].T for v in (step, start, bent, push, supply, warm)
