@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
@@ -110,7 +110,8 @@ def print_ur(found: Found) -> Stack:
     nominal, identified = arm_in(found)
     kind, frames = _ur_frames(chain(nominal))
     real = chain(identified)
-    fixed = frames[0] @ np.linalg.inv(of_rpy((0, 0, _height(frames)), (0, 0, 0)))
+    # d1 is how far the first two axes' crossing is above the arm's own base.
+    fixed = frames[0] @ np.linalg.inv(of_rpy((0, 0, frames[0][2, 3]), (0, 0, 0)))
     made = real.through(fixed, [nearest_on(*pair) for pair in zip(real.frames, frames, strict=True)])
     lines = ["kinematics:"]
     for name, m in zip(_UR_LINKS, made.origins, strict=True):
@@ -133,11 +134,6 @@ def print_ur(found: Found) -> Stack:
         f"The measured tool in `tool0`: {told_frame(made.last)} [m, rad]."
     )
     return Stack({"kinematics.yaml": "\n".join(lines) + "\n"}, arm_of(made, identified), load)
-
-
-def _height(frames: Sequence[Array]) -> float:
-    """d1: of the first two axes' crossing above the arm's own base [m]."""
-    return float(frames[0][2, 3])
 
 
 def _ur_frames(made: Chain) -> tuple[str, list[Array]]:

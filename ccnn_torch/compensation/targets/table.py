@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from torch import Tensor
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.display import identifiers, plain
 from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.files.write import csv_text
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
@@ -206,12 +205,9 @@ def _said(name: str, what: str, truth: Array, found: Array) -> str:
 
 
 def _csv(compensator: Compensator, grid: Array, values: Array) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     headers = [plain(c.header) for c in compensator.joints]
-    writer.writerow(headers + [f"deviation_{header}" for header in headers])
-    writer.writerows([repr(float(v)) for v in row] for row in np.hstack([grid, values]))
-    return text.getvalue()
+    names = headers + [f"deviation_{header}" for header in headers]
+    return csv_text([names, *(map(repr, row) for row in np.hstack([grid, values]).tolist())])
 
 
 def _screw(line: Array, up: Array, down: Array) -> str:
