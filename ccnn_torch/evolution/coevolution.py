@@ -140,7 +140,7 @@ def _in_blocks(judged: Callable[[slice, slice], Tensor], population: Genome, wid
     # What suits the device, and the budget of memory holds (in, out, and the masks').
     suits = _BLOCK.get(task.inputs.device.type, _BLOCK_ELSEWHERE)
     size = block_size(_COPIES * 8, _COPIES * 8 * suits)
-    return in_blocks(judged, *population.mask.shape[:2], max(1, width * task.inputs.shape[-1]), size)
+    return in_blocks(judged, population.mask.shape[:2], max(1, width * task.inputs.shape[-1]), size)
 
 
 def _errors(layer: int | None, population: Genome | None, representatives: Sequence[Genome], task: Task) -> Tensor:

@@ -92,7 +92,7 @@ def blocked_means(
         return kernel_means(queries[here, some], *picked(fixed, here), None if own is None else own[some])
 
     each = max(1, rows.shape[1] * (rows.shape[2] + 3 * inverse_bandwidths.shape[1]))
-    return in_blocks(of, *queries.shape[:2], each, block_size(rows), 2)
+    return in_blocks(of, queries.shape[:2], each, block_size(rows), 2)
 
 
 # Rows' worth of belief in the overall variance: a few squared residuals scatter by a factor of several.

@@ -70,8 +70,9 @@ class OneNetwork(ABC):
 
     def network(self, repeat: int) -> MaskedNetwork:
         """The model of one repeat, pruned of its dead nodes."""
-        own, spread = [[part[repeat, 0] for part in parts] for parts in self._model()], self._spread()
-        return MaskedNetwork(*own, spread.factors[repeat], spread.noise[repeat])
+        masks, weights = ([part[repeat, 0] for part in parts] for parts in self._model())
+        spread = self._spread()
+        return MaskedNetwork(masks, weights, spread.factors[repeat], spread.noise[repeat])
 
     def _spread(self) -> Spread:
         return readout_spread(*self._model(), self._data.inputs, self._data.targets, self._data.weights)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import pairwise
@@ -42,17 +42,16 @@ def blocks(count: int, bytes_each: int, default: int = _DEFAULT) -> Iterator[sli
     return (slice(first, end) for first, end in pairwise(ends))
 
 
-def in_blocks(
-    of: Callable[[slice, slice], _Tree], rows: int, columns: int, each: int, size: int, dim: int = 1
-) -> _Tree:
+def in_blocks(of: Callable[[slice, slice], _Tree], count: Sequence[int], each: int, size: int, dim: int = 1) -> _Tree:
     """`of` of some rows and columns at a time, put together.
 
     Args:
-        rows, columns: how many; a block has few columns before it has few rows.
+        count: how many rows and columns; a block has few columns before it has few rows.
         each: numbers that one column of one row takes, at least 1.
         size: numbers of a block, about.
         dim: dimension of the columns in the tensors that `of` gives; that of the rows is 0.
     """
+    rows, columns = count
     wide = min(columns, max(1, size // each))
     high = max(1, size // (each * wide))
     return joined(

@@ -249,7 +249,7 @@ class Rapid(Literals):
 _LIST = r"\[([^\[\]]*)\]"
 
 
-def frame_of(place: Sequence[float], rotation: Array) -> Array:
+def frame_of(place: Sequence[float] | Array, rotation: Array) -> Array:
     """The frame `4 x 4` [m] of a place [mm] and a rotation `3 x 3`."""
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = rotation, 1e-3 * np.array(place)
