@@ -155,7 +155,7 @@ def _errors(layer: int | None, population: Genome | None, representatives: Seque
             step = _individuals(population, 1 if signal.shared else sets)
         else:
             step = _sets(genome, signal.shared)
-        signal = _advance(signal, step, samples, task.targets if number == last else None, sets)
+        signal = _advance(signal, step, samples, task.targets if number == last else None)
         if number != layer and signal.shared:
             # The wide product has the sets beside each other in its rows: `r x (k out) x (p s)`.
             signal = _Signal(
@@ -202,7 +202,7 @@ def _bias(genome: Genome) -> Tensor:
     return genome.weight.new_zeros(genome.weight.shape[:-1])
 
 
-def _advance(signal: _Signal, step: _Step, samples: int, targets: Tensor | None, sets: int) -> _Signal:
+def _advance(signal: _Signal, step: _Step, samples: int, targets: Tensor | None) -> _Signal:
     """One layer: hidden (targets None) with sigmoid and forced zeros, or output, from which the targets are taken."""
     batch = len(step.weight)
     fed = torch.bmm(step.connected, signal.fed).view(batch, step.offset.shape[1], -1) > 0

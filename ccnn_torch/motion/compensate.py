@@ -57,14 +57,18 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
         own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], around.at(rows), found.errors)
         _refuse_absurd(model, name, found, wanted[rows], own.plain)
         command[rows], position[rows], plain[rows] = own.command, own.position, own.plain
-    # What the model leaves stays, and adds to what the correction does.
-    before, after = (np.hypot(np.sqrt(np.square(wanted - q).mean(0)), found.left) for q in (plain, position))
+
+    def errs(q: Array) -> Array:
+        # What the model leaves stays, and adds to what the correction does.
+        return np.asarray(np.hypot(np.sqrt(np.square(wanted - q).mean(0)), found.left))
+
+    before, after = errs(plain), errs(position)
     useless = after > (1 - _GAINED) * before
     if useless.any():
         command[:, useless] = wanted[:, useless]
         for _, rows in runs:
             position[rows] = moved(found.nominal, found.axes, time[rows], command[rows][None], around.at(rows))[0]
-        after = np.hypot(np.sqrt(np.square(wanted - position).mean(0)), found.left)
+        after = errs(position)
     added: dict[str, Array | list[str]] = {}
     for what, values in (("corrected", command), ("predicted", position)):
         for i, name in enumerate(names):

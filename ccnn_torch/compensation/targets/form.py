@@ -151,7 +151,6 @@ class Form:
         iterations: steps from the joints to their command.
         method: whose steps these are.
         limit: of the whole |deviation|, `n` [SI].
-        fallback_sd: standard deviation where the deviation is taken as 0, `n` [SI].
         dtype: `float64` or `float32`.
         programs: by name.
         routines: by name: `compensate`, `ideal`, and `deviation_sd` where it was asked for.
@@ -163,7 +162,6 @@ class Form:
     iterations: int
     method: str
     limit: Array
-    fallback_sd: Array
     dtype: str
     programs: dict[str, Program]
     routines: dict[str, Routine]

@@ -147,7 +147,7 @@ def _ur_frames(made: Chain) -> tuple[str, list[Array]]:
         # x is across the first two axes, which meet.
         x = np.cross(first[:3, 2], second[:3, 2])
         size = float(np.linalg.norm(x))
-        up = second[:3, 3] - second[:3, 2] * float(_along(gap, first, second))
+        up = second[:3, 3] - second[:3, 2] * float(_along(gap))
         for kind, sizes in _UR.items() if size > 0.5 else ():
             turned = np.stack([x / size, np.cross(first[:3, 2], x / size), first[:3, 2]], -1)
             frames = [matrix(turned, up)]
@@ -160,7 +160,7 @@ def _ur_frames(made: Chain) -> tuple[str, list[Array]]:
     )
 
 
-def _along(gap: Array, first: Array, second: Array) -> float:
+def _along(gap: Array) -> float:
     """How far from the origin of the second frame, against its z, that axis is nearest to the first one [m]."""
     flat = gap[:2, 2]
     return float(flat @ gap[:2, 3] / (flat @ flat))
