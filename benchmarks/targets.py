@@ -251,7 +251,7 @@ def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> Iter
     draw = torch.rand(100_000, n, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     given = (domain.centre + domain.half_range * (4 * draw - 2)).numpy()
     calls //= ROUNDS
-    with torch.inference_mode(), tempfile.TemporaryDirectory() as made:
+    with torch.no_grad(), tempfile.TemporaryDirectory() as made:
         wanted = compensator(torch.from_numpy(given))[1].numpy()
         # Of each way what times it, bytes, and how far its deviations are off, as a share of the limit.
         ways: dict[str, tuple[Callable[[], list[float]], int, float]] = {}

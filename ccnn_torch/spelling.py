@@ -29,3 +29,9 @@ def hint(name: str, candidates: Sequence[str], otherwise: str = "there are", mor
     """What to write instead of a name that is none of the candidates: the nearest, or all of them after `otherwise`."""
     near = nearest(name, candidates)
     return f"did you mean '{near}'?" if near else f"{otherwise} {', '.join(candidates) or 'none'}{more}"
+
+
+def nearest_hint(name: str, candidates: Sequence[str]) -> str:
+    """The candidate that is meant, to follow a sentence; empty where none is similar enough."""
+    near = nearest(name, candidates)
+    return f"; '{near}' is the nearest" if near else ""

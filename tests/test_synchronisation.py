@@ -86,7 +86,7 @@ def test_a_refinement_waits_once_a_trial_and_once_an_iteration() -> None:
     weights = [torch.randn(2, *shape, generator=draw, dtype=torch.float64) for shape in ((4, 4), (3, 5))]
     problem = pose_refinement(masks, weights, x, y, ones)
     state = start_refinement(problem, weights)
-    assert not waits(lambda: finish_refinement(problem, state, second_order(problem, state)))
+    assert not waits(lambda: finish_refinement(problem, state))
     known = second_order(problem, state)
     counted = waits(lambda: step_refinement(problem, state, known))
     assert counted.keys() == {"index"} and counted["index"] == factors(lambda: step_refinement(problem, state, known))

@@ -43,17 +43,14 @@ class ChebyshevExpansion(nn.Module):
     coefficients: Tensor
     _pick: Tensor
 
-    def __init__(
-        self, centre: Tensor, half_range: Tensor, degree: int, coefficients: Tensor | None = None, outputs: int = 0
-    ) -> None:
+    def __init__(self, centre: Tensor, half_range: Tensor, degree: int, outputs: int = 0) -> None:
         """outputs: how many, as many as joints when 0."""
         super().__init__()
         exponents = _exponents(len(centre), degree)
-        empty = centre.new_zeros(len(exponents), outputs or len(centre))
         self.degree = degree
         self.register_buffer("centre", centre)
         self.register_buffer("half_range", half_range)
-        self.register_buffer("coefficients", empty if coefficients is None else coefficients)
+        self.register_buffer("coefficients", centre.new_zeros(len(exponents), outputs or len(centre)))
         pick = torch.nn.functional.one_hot(exponents.mT, degree + 1).mT.to(centre.dtype)
         # `n x (degree + 1) x terms`
         self.register_buffer("_pick", pick.contiguous(), persistent=False)

@@ -21,7 +21,7 @@ from ccnn_torch.files.read import parse_json, read_text
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms.branches import EXACT, ROUNDED, arrives, follow
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
-from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import homogeneous, matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records.commanded import commanded_poses, is_commanded
 from ccnn_torch.records.headers import columns_there, pose_columns, read_pose, stack_columns
 from ccnn_torch.records.joint_map import JointMap, read_joint_map
@@ -134,8 +134,7 @@ class WantedPoses:
         else:
             joints = mechanism.solve_inverse(poses, guess=guess)
         # Of all full turns of a revolute joint the one nearest to the guess, or to the first one.
-        turning = torch.tensor([c.unit == "rad" for c in mechanism.joints])
-        joints = joints - torch.where(turning, 2 * torch.pi * torch.round((joints - guess) / (2 * torch.pi)), 0.0)
+        joints = nearest_turns(mechanism, joints, guess)
         lost = np.flatnonzero(~arrives(mechanism, joints, poses, within).numpy())
         if len(lost):
             raise InputError(
@@ -177,10 +176,7 @@ class WantedPoses:
 
 def frames_of(poses: Tensor) -> Tensor:
     """`... x 4 x 4` of x, y, z and rotation vectors `... x 6` [m, rad]."""
-    found = torch.eye(4, dtype=torch.float64).repeat(*poses.shape[:-1], 1, 1)
-    found[..., :3, :3] = rotation_vector_to_matrix(poses[..., 3:])
-    found[..., :3, 3] = poses[..., :3]
-    return found
+    return homogeneous(rotation_vector_to_matrix(poses[..., 3:]), poses[..., :3])
 
 
 def _units(table: Table, read: Sequence[str]) -> dict[str, str]:
@@ -198,6 +194,12 @@ def nearest_measured(mechanism: Mechanism, region: Tensor, pose: Tensor) -> Tens
     error = mechanism.pose_error(mechanism.forward_kinematics(joints), pose)
     turned = 0.0 if error.rotation is None else ROTATION_WEIGHT * error.rotation
     return joints[torch.nan_to_num(error.position + turned, nan=torch.inf).argmin()]
+
+
+def nearest_turns(mechanism: Mechanism, joints: Tensor, guess: Tensor) -> Tensor:
+    """Joints `... x n` [SI] by so many full turns elsewhere that revolute ones are nearest to a guess."""
+    turning = torch.tensor([c.unit == "rad" for c in mechanism.joints])
+    return joints - torch.where(turning, 2 * torch.pi * torch.round((joints - guess) / (2 * torch.pi)), 0.0)
 
 
 @dataclass

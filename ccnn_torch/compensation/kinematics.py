@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation.expansions import ChebyshevExpansion
 from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import homogeneous, rotation_vector_to_matrix, skew, vee
 
 # Of central differences of the fourth order [SI]: machines are about 1 m, and their kinematics are curved by about 1/m.
 _STEP = 5e-4
@@ -25,13 +25,6 @@ _SETTLED = 1e-13
 _LOST, _STEEPEST = 1e9, 1e6
 # Cosines of a right angle and their products with lengths: rounding [1 or m], and as zeros they cost nothing.
 _NOTHING = 1e-15
-
-
-def skew_vector(turn: Tensor) -> Tensor:
-    """Vector of the skew part of `... x 3 x 3`, `... x 3`: sin(angle) times the axis of a rotation; of a rate of
-    rotation the rate."""
-    half = (turn - turn.mT) / 2
-    return torch.stack([half[..., 2, 1], half[..., 0, 2], half[..., 1, 0]], dim=-1)
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
@@ -81,13 +74,11 @@ class Placed(NamedTuple):
         if self.rotation is None or shift.shape[-1] == 3:
             return self._replace(position=position)
         vector = shift[..., 3:]
-        zero = torch.zeros_like(vector[..., 0])
-        x, y, z = vector.unbind(-1)
-        skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*zero.shape, 3, 3)
+        turn = skew(vector)
         square = (vector * vector).sum(-1)[..., None, None]
         sine = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
         cosine = (1 - square / 12 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))) / 2
-        rotation = self.rotation + (sine * skew + cosine * (skew @ skew)) @ self.rotation
+        rotation = self.rotation + (sine * turn + cosine * (turn @ turn)) @ self.rotation
         return self._replace(position=position, rotation=rotation)
 
 
@@ -253,7 +244,7 @@ def frame_slope(function: Callable[[Tensor], tuple[Tensor, Tensor | None]], poin
     rotation = function(point)[1]
     assert rotation is not None
     # The skew part of dR Rᵀ is the rotation vector's, and its second order is symmetric.
-    return torch.cat([_difference(positions), _difference(skew_vector(rotations @ rotation.mT))], -2)
+    return torch.cat([_difference(positions), _difference(vee(rotations @ rotation.mT))], -2)
 
 
 def _pseudo_inverse(matrix: Tensor) -> Tensor:
@@ -322,7 +313,7 @@ def _links(arm: SerialArm) -> Tensor:
 
     def at(q: float) -> Tensor:
         joints = torch.full((len(arm.joints),), q, dtype=torch.float64)
-        return _homogeneous(*arm.link_transforms(joints, values))
+        return homogeneous(*arm.link_transforms(joints, values))
 
     zero, quarter, half = at(0.0), at(math.pi / 2), at(math.pi)
     turns = arm.revolute[:, None, None]
@@ -330,8 +321,8 @@ def _links(arm: SerialArm) -> Tensor:
     cosine = torch.where(turns, (zero - half) / 2, 0.0)
     other = torch.where(turns, quarter - constant, (half - zero) / math.pi)
     links = torch.stack([cosine, other, constant])
-    base = _homogeneous(rotation_vector_to_matrix(values[3:6]), values[:3])
-    tool = _homogeneous(rotation_vector_to_matrix(values[-3:]), values[-6:-3])
+    base = homogeneous(rotation_vector_to_matrix(values[3:6]), values[:3])
+    tool = homogeneous(rotation_vector_to_matrix(values[-3:]), values[-6:-3])
     links[:, 0] = base @ links[:, 0]
     links[:, -1] = links[:, -1] @ tool
     return torch.where(links.abs() < _NOTHING, 0.0, links)
@@ -345,11 +336,4 @@ def _screws(links: Tensor) -> tuple[Tensor, Tensor]:
     """
     rate = torch.linalg.solve(links[0] + links[2], links[1])
     rate = torch.where(rate.abs() < _NOTHING, 0.0, rate)
-    return skew_vector(rate[..., :3, :3])[..., None], rate[..., :3, 3:]
-
-
-def _homogeneous(rotation: Tensor, translation: Tensor) -> Tensor:
-    """`... x 4 x 4` of a rotation `... x 3 x 3` and a translation `... x 3`."""
-    whole = rotation.new_zeros(*rotation.shape[:-2], 4, 4)
-    whole[..., :3, :3], whole[..., :3, 3], whole[..., 3, 3] = rotation, translation, 1.0
-    return whole
+    return vee(rate[..., :3, :3])[..., None], rate[..., :3, 3:]

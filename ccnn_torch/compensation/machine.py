@@ -16,11 +16,10 @@ from ccnn_torch.compensation.kinematics import (
     Placed,
     gauss_jordan,
     inverse,
-    skew_vector,
 )
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, mechanism_from_description
 from ccnn_torch.mechanisms.machines.links import compose
-from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix, vee
 
 # Keeps what is inverted regular in the middle of a singular pose: of what shows how near it is, and of a step [m²].
 _NEAR, _REGULAR = 1e-10, 1e-12
@@ -211,7 +210,7 @@ class Machine(nn.Module):
         gap = aim[..., :3] - placed.position
         if placed.rotation is not None:
             turn = aim[..., 3:12].reshape(*aim.shape[:-1], 3, 3) @ placed.rotation.mT
-            gap = torch.cat([gap, self.rule.rotation_weight * skew_vector(turn)], -1)
+            gap = torch.cat([gap, self.rule.rotation_weight * vee(turn)], -1)
         # Where the machine has no pose, back to the ideal joints.
         pull = aim[..., -1:] if placed.lost is None else aim[..., -1:] + placed.lost
         slope = self._slope(placed)
@@ -288,7 +287,7 @@ class Frames(nn.Module):
         rotation, position = compose(compose(by[0], (rotation, position)), by[1])
         for _ in range(self._STEPS):
             place, turn = inside.frame(rows)
-            gap = torch.cat([position - place, skew_vector(rotation @ turn.mT)], -1)
+            gap = torch.cat([position - place, vee(rotation @ turn.mT)], -1)
             rows = rows + inside.coordinates(rows, gap)
         return rows.reshape(pose.shape)
 

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from inspect import signature
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -152,45 +151,6 @@ def routines_of(
     ]
 
 
-class Step(NamedTuple):
-    """A step in units of the limits, and what gives another vector's share of it, `... x n` each."""
-
-    whole: Tensor
-    dual: Tensor
-
-
-def next_correction(
-    deviation: Tensor, correction: Tensor, steps: list[Step], limit: Tensor
-) -> tuple[Tensor, list[Step]]:
-    """One step of Broyden's "good" method for d = δ(q - d), in sums, products, quotients and a maximum.
-
-    The fixed point d ← δ(q - d) gains one factor of δ's slope with each evaluation of δ. This method learns that slope
-    from the steps that were done, so that each gains more than the one before. It starts from the fixed point and needs
-    no derivative; no matrix is kept, only the steps (C. T. Kelley, "Iterative methods for linear and nonlinear
-    equations", SIAM 1995, section 7.3).
-
-    Args:
-        deviation: δ(q - correction), `... x n` [SI].
-        correction: d, `... x n` [SI]; 0 at first.
-        steps: those before, in order; blank ones (zeros) change nothing.
-        limit: of |δ|, `n` [SI].
-
-    Returns:
-        The next d, and the steps with this one.
-    """
-    ones = torch.ones_like(limit)
-    unit, ones = torch.where(limit > 0, limit, ones), ones.unsqueeze(-1)
-    whole = (deviation - correction) / unit
-    if steps:
-        for before, after in pairwise(steps):
-            # Steps shrink, so that the share is below 1 but for rounding, which must not grow.
-            whole = whole + after.whole * torch.clamp((before.dual * whole) @ ones, -1.0, 1.0)
-        whole = whole / torch.clamp_min(1 - (steps[-1].dual * whole) @ ones, _LEAST)
-    # A sum as a product: engines with a narrow operator list have no other reduction.
-    dual = whole / ((whole * whole) @ ones + _ROUNDING**2)
-    return correction + unit * whole, [*steps, Step(whole, dual)]
-
-
 def status_of(strange: Tensor, inside: Tensor, doubt: Tensor | None = None) -> Tensor:
     """Of a command, `... x 1`, int64.
 
@@ -328,12 +288,32 @@ class Functions:
         return {"found": found, "excess": excess, "weight": weight, "features": features, "doubt": doubt}
 
     def following(self, found: Tensor, correction: Tensor, steps: Tensor) -> Variables:
-        """The next correction, and the last steps with this one, of which there is room for so many."""
-        n = self.joints
-        parts = [steps[..., k : k + n] for k in range(0, steps.shape[-1], n)]
-        before = [Step(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)]
-        following, after = next_correction(found, correction, before, self.own.most)
-        return {"next": following, "done": torch.cat([part for step in after[-self.room :] for part in step], -1)}
+        """One step of Broyden's "good" method for d = δ(q - d), in sums, products, quotients and a maximum.
+
+        The fixed point d ← δ(q - d) gains one factor of δ's slope with each evaluation of δ. This method learns that
+        slope from the steps that were done, so that each gains more than the one before. It starts from the fixed point
+        and needs no derivative; no matrix is kept, only the steps (C. T. Kelley, "Iterative methods for linear and
+        nonlinear equations", SIAM 1995, section 7.3).
+
+        Args:
+            found: δ(q - correction), `... x n` [SI].
+            correction: d, `... x n` [SI]; 0 at first.
+            steps: those before, in order, `... x 2 n k`, each in units of the limits and with what gives another
+                vector's share of it; blank ones (zeros) change nothing. There is room for so many of the last ones.
+        """
+        n, limit = self.joints, self.own.most
+        before, ones = [steps[..., k : k + n] for k in range(0, steps.shape[-1], n)], torch.ones_like(limit)
+        unit, ones = torch.where(limit > 0, limit, ones), ones.unsqueeze(-1)
+        step = (found - correction) / unit
+        # Steps shrink, so that the share is below 1 but for rounding, which must not grow.
+        for dual, after in zip(before[1::2], before[2::2], strict=False):
+            step = step + after * torch.clamp((dual * step) @ ones, -1.0, 1.0)
+        if before:
+            step = step / torch.clamp_min(1 - (before[-1] * step) @ ones, _LEAST)
+        # A sum as a product: engines with a narrow operator list have no other reduction.
+        dual = step / ((step * step) @ ones + _ROUNDING**2)
+        done = torch.cat([*before, step, dual][-2 * self.room :], -1)
+        return {"next": correction + unit * step, "done": done}
 
     def aim(self, q: Tensor) -> Variables:
         assert self.own.machine is not None

@@ -30,7 +30,7 @@ from ccnn_torch.evolution.genome import (
 )
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import CCNNSettings
-from ccnn_torch.numerics.blocks import block_size
+from ccnn_torch.numerics.blocks import block_size, in_blocks
 from ccnn_torch.numerics.trees import chosen, joined, mapped, picked
 
 # Input of an unfed node: sigmoid(-1e4) is exactly 0, and unlike -inf it never makes a NaN.
@@ -94,16 +94,13 @@ class _Step(NamedTuple):
     offset: Tensor
 
 
-def joined_errors(
-    layer: int, population: Genome, representatives: Sequence[Genome], task: Task, block: int | None = None
-) -> Tensor:
+def joined_errors(layer: int, population: Genome, representatives: Sequence[Genome], task: Task) -> Tensor:
     """Mean Euclidean output error of every joined network.
 
     Args:
         layer: the layer that the individuals belong to.
         population: `r x p x ...`.
         representatives: one a layer, `r x k x ...`; that of `layer` itself is not read.
-        block: number of activations computed at a time; None = what suits the device.
 
     Returns:
         `r x p x k` [1].
@@ -114,15 +111,14 @@ def joined_errors(
         own = mapped(lambda value: value[here, some], population)
         return _errors(layer, own, picked(list(representatives), here), picked(task, here))
 
-    return _in_blocks(judged, population, sets * _widest(representatives), task, block)
+    return _in_blocks(judged, population, sets * _widest(representatives), task)
 
 
-def network_errors(networks: Sequence[Genome], task: Task, block: int | None = None) -> Tensor:
+def network_errors(networks: Sequence[Genome], task: Task) -> Tensor:
     """Mean Euclidean output error of whole networks: sets of representatives without an individual among them.
 
     Args:
         networks: one layer of all networks each, `r x p x ...`.
-        block: as in `joined_errors`.
 
     Returns:
         `r x p` [1].
@@ -132,29 +128,19 @@ def network_errors(networks: Sequence[Genome], task: Task, block: int | None = N
         own = mapped(lambda value: value[here, some], list(networks))
         return _errors(None, None, own, picked(task, here))[:, 0]
 
-    return _in_blocks(judged, networks[0], _widest(networks), task, block)
+    return _in_blocks(judged, networks[0], _widest(networks), task)
 
 
 def _widest(layers: Sequence[Genome]) -> int:
     return max(genome.mask.shape[-2] for genome in layers)
 
 
-def _in_blocks(
-    judged: Callable[[slice, slice], Tensor], population: Genome, width: int, task: Task, block: int | None
-) -> Tensor:
+def _in_blocks(judged: Callable[[slice, slice], Tensor], population: Genome, width: int, task: Task) -> Tensor:
     """`judged` of some repeats and individuals at a time, `r x p x ...`; width: activations each and row."""
-    repeats, individuals = population.mask.shape[:2]
-    each = max(1, width * task.inputs.shape[-1])
     # What suits the device, and the budget of memory holds (in, out, and the masks').
     suits = _BLOCK.get(task.inputs.device.type, _BLOCK_ELSEWHERE)
-    block = block or block_size(_COPIES * 8, _COPIES * 8 * suits)
-    columns = min(individuals, max(1, block // each))
-    rows = max(1, block // (each * columns))
-    parts = [
-        torch.cat([judged(slice(r, r + rows), slice(c, c + columns)) for c in range(0, individuals, columns)], 1)
-        for r in range(0, repeats, rows)
-    ]
-    return torch.cat(parts)
+    size = block_size(_COPIES * 8, _COPIES * 8 * suits)
+    return in_blocks(judged, population.mask.shape[:2], max(1, width * task.inputs.shape[-1]), size)
 
 
 def _errors(layer: int | None, population: Genome | None, representatives: Sequence[Genome], task: Task) -> Tensor:
@@ -169,7 +155,7 @@ def _errors(layer: int | None, population: Genome | None, representatives: Seque
             step = _individuals(population, 1 if signal.shared else sets)
         else:
             step = _sets(genome, signal.shared)
-        signal = _advance(signal, step, samples, task.targets if number == last else None, sets)
+        signal = _advance(signal, step, samples, task.targets if number == last else None)
         if number != layer and signal.shared:
             # The wide product has the sets beside each other in its rows: `r x (k out) x (p s)`.
             signal = _Signal(
@@ -216,7 +202,7 @@ def _bias(genome: Genome) -> Tensor:
     return genome.weight.new_zeros(genome.weight.shape[:-1])
 
 
-def _advance(signal: _Signal, step: _Step, samples: int, targets: Tensor | None, sets: int) -> _Signal:
+def _advance(signal: _Signal, step: _Step, samples: int, targets: Tensor | None) -> _Signal:
     """One layer: hidden (targets None) with sigmoid and forced zeros, or output, from which the targets are taken."""
     batch = len(step.weight)
     fed = torch.bmm(step.connected, signal.fed).view(batch, step.offset.shape[1], -1) > 0

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.evolution.genome import kept
-from ccnn_torch.evolution.network import alive_nodes, forward, hidden_signal, prune, with_slots
+from ccnn_torch.evolution.network import forward, hidden_signal, prune, with_slots
 from ccnn_torch.evolution.waves import Harmonics, Waves
 
 _SMALLEST_NOISE = 1e-12
@@ -88,7 +88,7 @@ def spread_variance(
     """Predictive variance of every row, `... x s x o` [1].
 
     Args:
-        masks, weights: of the averaged network (`average`), one a layer, `... x out x in`.
+        masks, weights: of the averaged network (`averaged`), one a layer, `... x out x in`.
         inputs: `... x s x i` [1].
         waves: of the averaged network, `... x k`.
     """
@@ -183,28 +183,32 @@ class MaskedNetwork(nn.Module):
         slots = 0 if waves is None else len(waves.frequency)
         read = masks[0].shape[-1] - (2 * slots if len(masks) == 1 else 0)
         unread = 0 if inputs is None else inputs - read
+        outputs = len(masks[-1])
+        if factors is not None:
+            # Rows of the output layer like its weights, they lose the same columns.
+            rows = factors.flatten(0, 1)
+            own = nn.functional.pad(weights[-1], (0, rows.shape[-1] - weights[-1].shape[-1]))
+            masks = [*masks[:-1], torch.cat([masks[-1], masks[-1].any(0).expand(len(rows), -1)])]
+            weights = [*weights[:-1], torch.cat([own, rows])]
         small_masks, small_weights = prune(masks, weights)
         # Slots that no output reads take no part.
         used = _used_slots(small_masks[-1], slots)
-        last = _kept_columns(small_weights[-1], small_masks[-1].shape[-1] - 2 * slots, used)
-        small_weights = [*small_weights[:-1], last]
+        hidden = small_masks[-1].shape[-1] - 2 * slots
+        small_weights[-1] = with_slots(small_weights[-1], hidden, slots, lambda columns: columns[..., used])
         small_weights[0] = _padded(small_weights[0], read, unread)
+        small_weights[-1], rows = small_weights[-1].tensor_split([outputs])
         widths = [read + unread, *(len(mask) for mask in small_masks[:-1])]
         widths[-1] += 2 * int(used.sum())
         layers = [_linear(weight, width) for weight, width in zip(small_weights, widths, strict=True)]
         self.layers = nn.ModuleList(layers)
-        outputs = layers[-1].out_features
-        if factors is None or noise is None:
-            factors = layers[-1].weight.new_zeros(outputs, 0, layers[-1].in_features + 1)
-            noise = layers[-1].weight.new_ones(outputs)
-        else:
-            factors = _kept_factors(masks, factors, slots, used, read, unread)
-            # The same sum of squares in as few terms as the rank; a described network's are zeros, and few.
-            if factors.shape[-2] > factors.shape[-1] and bool(factors.any()):
-                _, sizes, axes = torch.linalg.svd(torch.linalg.qr(factors, mode="r")[1])
-                rounding = sizes.shape[-1] * torch.finfo(sizes.dtype).eps * sizes[..., :1]
-                rank = int((sizes > rounding).sum(-1).max())
-                factors = (sizes.unsqueeze(-1) * axes)[..., :rank, :]
+        noise = layers[-1].weight.new_ones(outputs) if noise is None else noise
+        factors = rows.reshape(outputs, len(rows) // outputs, layers[-1].in_features + 1)
+        # The same sum of squares in as few terms as the rank; a described network's are zeros, and few.
+        if factors.shape[-2] > factors.shape[-1] and bool(factors.any()):
+            _, sizes, axes = torch.linalg.svd(torch.linalg.qr(factors, mode="r")[1])
+            rounding = sizes.shape[-1] * torch.finfo(sizes.dtype).eps * sizes[..., :1]
+            rank = int((sizes > rounding).sum(-1).max())
+            factors = (sizes.unsqueeze(-1) * axes)[..., :rank, :]
         self.register_buffer("factors", factors.flatten(0, 1).contiguous())
         self.register_buffer("noise", noise.clone())
         frequencies = layers[0].weight.new_zeros(int(used.sum()), read + unread)
@@ -311,26 +315,6 @@ def _used_slots(mask: Tensor, slots: int) -> Tensor:
     return waves[:slots] | waves[slots:]
 
 
-def _kept_columns(values: Tensor, hidden: int, used: Tensor) -> Tensor:
-    """Columns of the hidden nodes, of the slots in use, and the columns after them."""
-    return with_slots(values, hidden, len(used), lambda columns: columns[..., used])
-
-
 def _padded(weight: Tensor, read: int, unread: int) -> Tensor:
     """Columns of zeros for features that the layer does not read."""
     return torch.cat([weight[:, :read], weight.new_zeros(len(weight), unread), weight[:, read:]], -1)
-
-
-def _kept_factors(masks: Sequence[Tensor], factors: Tensor, slots: int, used: Tensor, read: int, unread: int) -> Tensor:
-    """Factors `o x q x (h + 1)` with the columns that the pruned network has."""
-    hidden = factors.shape[-1] - 1 - 2 * slots
-    factors = _kept_columns(factors, hidden, used)
-    alive = alive_nodes(masks)
-    if not alive:
-        zeros = factors.new_zeros(*factors.shape[:-1], unread)
-        return torch.cat([factors[..., :read], zeros, factors[..., read:]], -1)
-    if not bool(alive[0].any()):
-        # One layer without connections to the inputs is left; what a constant is unsure of is its value.
-        zeros = factors.new_zeros(*factors.shape[:-1], read + unread)
-        return torch.cat([zeros, factors[..., hidden:]], -1)
-    return torch.cat([factors[..., :hidden][..., alive[-1]], factors[..., hidden:]], -1)

@@ -92,46 +92,6 @@ def _affine(signal: Tensor, weight: Tensor) -> Tensor:
     return product + weight[..., width].unsqueeze(-2) if weight.shape[-1] > width else product
 
 
-def average(masks: Sequence[Tensor], weights: Sequence[Tensor], slots: int = 0) -> tuple[list[Tensor], list[Tensor]]:
-    """The mean of several networks of one shape as one masked network: their hidden nodes are concatenated.
-
-    Args:
-        masks, weights: one a layer, `... x m x out x in` and `... x m x out x (in or in + 1)`, m = networks.
-        slots: slots for periodic nodes of each network; the wide network has them side by side too (`average_waves`).
-
-    Returns:
-        The same without the dimension `m`; a hidden layer has m times the nodes, blocks of zeros between networks.
-    """
-    members, last = masks[0].shape[-3], len(masks) - 1
-    wide_masks, wide_weights = [], []
-    for layer, (mask, weight) in enumerate(zip(masks, weights, strict=True)):
-        width = mask.shape[-1]
-        connected = kept(mask, weight)
-        parts = [mask, connected[..., :width], connected[..., width:]]
-        if layer == last:
-            # Outputs are summed, so every share is divided.
-            parts = [mask, connected[..., :width] / members, connected[..., width:].mean(-3)]
-        if layer == last and slots:
-            hidden = width - 2 * slots
-            connections = [
-                torch.cat(
-                    [_side_by_side(piece[0], layer == 0, True), *(_side_by_side(p, False, True) for p in piece[1:])], -1
-                )
-                for piece in (torch.split(part, [hidden, slots, slots], -1) for part in parts[:2])
-            ]
-        else:
-            connections = [_side_by_side(part, layer == 0, layer == last) for part in parts[:2]]
-        bias = parts[2] if layer == last else parts[2].flatten(-3, -2)
-        wide_masks.append(connections[0] > 0)
-        wide_weights.append(torch.cat([connections[1], bias], dim=-1))
-    return wide_masks, wide_weights
-
-
-def average_waves(waves: Waves) -> Waves:
-    """Periodic nodes of several networks side by side: `... x m x k` to `... x (m k)`."""
-    return Waves(waves.source.flatten(-2), waves.frequency.flatten(-2))
-
-
 def _side_by_side(blocks: Tensor, first: bool, last: bool) -> Tensor:
     """Matrices `... x m x out x in` of networks that share the inputs (first layer) or add up in the outputs (last)."""
     if first and last:
@@ -226,12 +186,32 @@ def with_slots(values: Tensor, hidden: int, slots: int, fitted: Callable[[Tensor
     return torch.cat([parts[0], fitted(parts[1]), fitted(parts[2]), parts[3]], -1)
 
 
-def without_waves(bundle: Bundle) -> Bundle:
-    """The sigmoid networks alone."""
-    return resized(bundle, 0)
-
-
 def averaged(bundle: Bundle) -> Bundle:
-    """The mean of the networks along the last leading dimension, as one network each."""
-    masks, weights = average(bundle.masks, bundle.weights, bundle.slots)
-    return Bundle(masks, weights, average_waves(bundle.waves))
+    """The mean of the `m` networks along the last leading dimension, `... x m`, as one: they stand side by side.
+
+    A hidden layer has m times the nodes, with blocks of zeros between networks, and there are m times the slots.
+    """
+    masks, weights, waves = bundle
+    members, last, slots = masks[0].shape[-3], len(masks) - 1, bundle.slots
+    wide_masks, wide_weights = [], []
+    for layer, (mask, weight) in enumerate(zip(masks, weights, strict=True)):
+        width = mask.shape[-1]
+        connected = kept(mask, weight)
+        parts = [mask, connected[..., :width], connected[..., width:]]
+        if layer == last:
+            # Outputs are summed, so every share is divided.
+            parts = [mask, connected[..., :width] / members, connected[..., width:].mean(-3)]
+        if layer == last and slots:
+            hidden = width - 2 * slots
+            connections = [
+                torch.cat(
+                    [_side_by_side(piece[0], layer == 0, True), *(_side_by_side(p, False, True) for p in piece[1:])], -1
+                )
+                for piece in (torch.split(part, [hidden, slots, slots], -1) for part in parts[:2])
+            ]
+        else:
+            connections = [_side_by_side(part, layer == 0, layer == last) for part in parts[:2]]
+        bias = parts[2] if layer == last else parts[2].flatten(-3, -2)
+        wide_masks.append(connections[0] > 0)
+        wide_weights.append(torch.cat([connections[1], bias], dim=-1))
+    return Bundle(wide_masks, wide_weights, Waves(waves.source.flatten(-2), waves.frequency.flatten(-2)))

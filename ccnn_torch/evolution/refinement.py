@@ -13,11 +13,9 @@ the same in steps, with everything that changes in a `RefinementState` of plain 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,7 +32,7 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class RefinementProblem:
-    """What stays fixed: `b` networks (the leading dimensions in one), their data and the settings.
+    """What stays fixed: `b` networks, their data and the settings.
 
     Attributes:
         network: masks of the `b` networks and what follows from them.
@@ -43,7 +41,6 @@ class RefinementProblem:
         rows: row weights, `b x s`.
         metric: `b x s x c x o`, or None.
         groups: prior group of every weight, `k`, int64; the last group is never held back.
-        leading: the leading dimensions as given.
         group_count: number of prior groups, that last one included.
         wave_groups: which of them are of periodic nodes, int64.
         warm_up: iterations before the first estimate of the precisions.
@@ -55,7 +52,6 @@ class RefinementProblem:
     rows: Tensor
     metric: Tensor | None
     groups: Tensor
-    leading: tuple[int, ...]
     group_count: int
     wave_groups: Tensor
     warm_up: int
@@ -105,9 +101,9 @@ class Precisions(NamedTuple):
     """What a refinement has estimated beside the weights; 0 = not known.
 
     Attributes:
-        prior: precision of each prior group, `... x g`.
-        noise: precision of each channel's noise, `... x c`.
-        damping: `...`.
+        prior: precision of each prior group, `b x g`.
+        noise: precision of each channel's noise, `b x c`.
+        damping: `b`.
     """
 
     prior: Tensor
@@ -120,35 +116,27 @@ class Refined:
     """Refined networks.
 
     Attributes:
-        weights: per layer `... x out x in (+ 1)`; those that take no part are as they were given.
-        waves: periodic nodes with their refined frequencies, `... x k`.
-        error: weighted mean square of the residual in its channels, on the rows refined on, `...`.
-        objective: misfit and penalty under the last precisions, `...`.
-        effective_parameters: weights determined by the data, `...`.
-        noise: precision of each channel's noise, `... x c`.
+        weights: per layer `b x out x in (+ 1)`; those that take no part are as they were given.
+        waves: periodic nodes with their refined frequencies, `b x k`.
         log_evidence: logarithm of the probability of the targets given the masks and precisions, up to a constant of
-            the data (MacKay 1992, eq. 2.23); compares networks refined on the same rows. `...`.
+            the data (MacKay 1992, eq. 2.23); compares networks refined on the same rows. `b`.
         precisions: with which it ended.
         iterations: iterations done.
     """
 
     weights: list[Tensor]
     waves: Waves
-    error: Tensor
-    objective: Tensor
-    effective_parameters: Tensor
-    noise: Tensor
     log_evidence: Tensor
     precisions: Precisions
     iterations: int
 
 
 def part_of_problem(problem: RefinementProblem, index: Tensor) -> RefinementProblem:
-    """The problem of some of the networks, numbered as in the batch; they lead in one dimension."""
+    """The problem of some of the networks, numbered as in the batch."""
     if len(index) == len(problem.rows):
         return problem
     parts = {name: picked(getattr(problem, name), index) for name in ("network", "inputs", "targets", "rows", "metric")}
-    return replace(problem, leading=(len(index),), **parts)
+    return replace(problem, **parts)
 
 
 _PRECISION_RANGE = (1e-8, 1e12)
@@ -184,19 +172,17 @@ def refine(
     found in the end is never above that of the given weights.
 
     Args:
-        masks: per layer `... x out x in`, bool.
-        weights: per layer `... x out x in + 1`, the last column a bias, always on; or all `... x out x in`.
-        inputs: `... x s x i`, about in [-1, 1].
-        targets: `... x s x o`, of about unit deviation.
-        row_weights: `... x s`; 0 leaves a row out, even with NaN.
+        masks: per layer `b x out x in`, bool.
+        weights: per layer `b x out x in + 1`, the last column a bias, always on; or all `b x out x in`.
+        inputs: `b x s x i`, about in [-1, 1].
+        targets: `b x s x o`, of about unit deviation.
+        row_weights: `b x s`; 0 leaves a row out, even with NaN.
         iterations: Levenberg-Marquardt iterations, at most.
-        row_metric: `... x s x c x o`: the residual of a row is this matrix times (output - target), so that errors
+        row_metric: `b x s x c x o`: the residual of a row is this matrix times (output - target), so that errors
             are judged in other channels than the outputs' own, as the pose error that joint deviations cause.
-        waves: periodic nodes `... x k`, whose columns are last in the output's mask and weights; their frequencies
+        waves: periodic nodes `b x k`, whose columns are last in the output's mask and weights; their frequencies
             are refined as well.
         known: precisions of an earlier refinement to go on from; without them these networks begin anew.
-
-    Leading dimensions of all arguments broadcast against each other.
     """
     warm_up = warm_up if known is None else 0
     problem = pose_refinement(masks, weights, inputs, targets, row_weights, row_metric, waves, warm_up)
@@ -220,7 +206,7 @@ def refine(
         state = put(state, going, step_refinement(part, now, local))
     if bool((highest > -torch.inf).any()):
         # The last one has not been judged; re-estimated precisions may have taken it downhill.
-        last = log_evidence(problem, state)
+        last = log_evidence(problem, state, second_order(problem, state))
         worse = torch.nonzero(~(last >= highest) & (highest > -torch.inf)).flatten()
         state = put(state, worse, picked(best, worse))._replace(iteration=state.iteration)
     worse = ~(_objective(problem, state, state.weights) <= _objective(problem, state, start.weights))
@@ -239,35 +225,17 @@ def pose_refinement(
     warm_up: int = WARM_UP,
 ) -> RefinementProblem:
     """The fixed part of a refinement; arguments as in `refine`."""
-    metrics = [] if row_metric is None else [row_metric.shape[:-3]]
-    leading = np.broadcast_shapes(
-        *(m.shape[:-2] for m in masks),
-        *(w.shape[:-2] for w in weights),
-        inputs.shape[:-2],
-        targets.shape[:-2],
-        row_weights.shape[:-1],
-        *metrics,
-    )
-    rows = _flatten(row_weights, leading, 1)
-    there = rows > 0
+    there = row_weights > 0
     bias = weights[0].shape[-1] == masks[0].shape[-1] + 1
     slots = 0 if waves is None else waves.frequency.shape[-1]
     groups = prior_groups([m.shape[-2:] for m in masks], bias, slots)
-    flat_metric = None
-    if row_metric is not None:
-        flat_metric = _flatten(row_metric, leading, 3).masked_fill(~there[..., None, None], 0)
     return RefinementProblem(
-        network=network_of(
-            [_flatten(m, leading, 2) for m in masks],
-            bias,
-            None if waves is None else Waves(*(_flatten(part, leading, 1) for part in waves)),
-        ),
-        inputs=_flatten(inputs, leading, 2).masked_fill(~there.unsqueeze(-1), 0),
-        targets=_flatten(targets, leading, 2).masked_fill(~there.unsqueeze(-1), 0),
-        rows=rows,
-        metric=flat_metric,
-        groups=groups.to(rows.device),
-        leading=leading,
+        network=network_of(masks, bias, waves),
+        inputs=inputs.masked_fill(~there.unsqueeze(-1), 0),
+        targets=targets.masked_fill(~there.unsqueeze(-1), 0),
+        rows=row_weights,
+        metric=None if row_metric is None else row_metric.masked_fill(~there[..., None, None], 0),
+        groups=groups.to(row_weights.device),
         group_count=int(groups.max()) + (1 if bias or slots else 2),
         wave_groups=wave_groups(int(groups.max()), masks[-1].shape[-2], slots),
         warm_up=warm_up,
@@ -277,11 +245,9 @@ def pose_refinement(
 def start_refinement(
     problem: RefinementProblem, weights: list[Tensor], waves: Waves | None = None, known: Precisions | None = None
 ) -> RefinementState:
-    """State before the first iteration. weights: per layer `... x out x in (+ 1)`; waves and known as in `refine`."""
-    parts = [_flatten(w, problem.leading, 2).flatten(1) for w in weights]
-    if waves is not None:
-        parts.append(_flatten(waves.frequency, problem.leading, 1))
-    flat = torch.cat(parts, dim=-1)
+    """State before the first iteration. weights: per layer `b x out x in (+ 1)`; waves and known as in `refine`."""
+    lines = [] if waves is None else [waves.frequency]
+    flat = torch.cat([*(w.flatten(1) for w in weights), *lines], dim=-1)
     batch = flat.shape[0]
     group_count = problem.group_count
     prior = flat.new_full((batch, group_count), _FIRST_PRIOR)
@@ -310,15 +276,12 @@ def start_refinement(
     )
 
 
-def step_refinement(
-    problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None
-) -> RefinementState:
+def step_refinement(problem: RefinementProblem, state: RefinementState, known: SecondOrder) -> RefinementState:
     """One iteration: a damped step that lowers the objective, or none; then new precisions.
 
     Args:
-        known: `second_order` of this state, where the caller has it already.
+        known: `second_order` of this state.
     """
-    known = known or second_order(problem, state)
     gradient, matrix = known.gradient, known.matrix
     before = _objective(problem, state, state.weights)
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
@@ -351,36 +314,22 @@ def step_refinement(
     return _estimate_precisions(problem, moved, known)
 
 
-def finish_refinement(problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None) -> Refined:
-    """Weights in their layers and what is known of the fit; `known` as in `step_refinement`."""
-    evidence = log_evidence(problem, state, known)
-    objective = _objective(problem, state, state.weights)
-    squares = _squares(problem, state.weights)
-    leading = problem.leading
+def finish_refinement(problem: RefinementProblem, state: RefinementState) -> Refined:
+    """Weights in their layers and what is known of the fit."""
     return Refined(
-        weights=[w.reshape(*leading, *w.shape[-2:]) for w in problem.network.split(state.weights)],
-        waves=Waves(
-            problem.network.source.reshape(*leading, -1),
-            problem.network.frequencies(state.weights).reshape(*leading, -1),
-        ),
-        error=(squares.sum(-1) / (_row_count(problem) * squares.shape[-1])).reshape(leading),
-        objective=objective.reshape(leading),
-        effective_parameters=state.effective.sum(-1).reshape(leading),
-        noise=state.noise.reshape(*leading, -1),
-        log_evidence=evidence.reshape(leading),
-        precisions=Precisions(
-            state.prior.reshape(*leading, -1), state.noise.reshape(*leading, -1), state.damping.reshape(leading)
-        ),
+        weights=problem.network.split(state.weights),
+        waves=Waves(problem.network.source, problem.network.frequencies(state.weights)),
+        log_evidence=log_evidence(problem, state, second_order(problem, state)),
+        precisions=Precisions(state.prior, state.noise, state.damping),
         iterations=int(state.iteration),
     )
 
 
-def log_evidence(problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None) -> Tensor:
+def log_evidence(problem: RefinementProblem, state: RefinementState, known: SecondOrder) -> Tensor:
     """Log evidence of the weights' prior and the noise (Laplace's approximation), but for a constant: `b` [nat].
 
     -inf where the normal matrix has no Cholesky factor, about which the approximation would be.
     """
-    known = known or second_order(problem, state)
     log_determinant = 2 * known.root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     counted = problem.network.active & (problem.groups != state.prior.shape[-1] - 1)
     log_prior = (state.prior.log()[:, problem.groups] * counted).sum(-1)
@@ -456,8 +405,3 @@ def _estimate_precisions(problem: RefinementProblem, state: RefinementState, kno
         effective=torch.where(usable, effective, state.effective),
     )
     return estimated._replace(noise=_noise(problem, estimated))
-
-
-def _flatten(tensor: Tensor, leading: tuple[int, ...], trailing: int) -> Tensor:
-    tail = tensor.shape[tensor.dim() - trailing :]
-    return tensor.expand(*leading, *tail).reshape(math.prod(leading), *tail)

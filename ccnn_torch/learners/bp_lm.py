@@ -23,7 +23,7 @@ from ccnn_torch.evolution.refinement import (
 from ccnn_torch.evolution.settings import STRICT, Above, Count, Widths
 from ccnn_torch.learners.protocol import TrainingData, weighted_mse
 from ccnn_torch.learners.rows import OneNetwork, usable_rows
-from ccnn_torch.numerics.trees import picked, put
+from ccnn_torch.numerics.trees import mapped, picked, put
 
 _STARTS = 0
 
@@ -82,17 +82,16 @@ class BPLM(OneNetwork):
         """
         self._data = data = usable_rows(data)
         sizes = (data.inputs.shape[-1], *self.settings.hidden, data.targets.shape[-1])
-        self._leading = (len(data.seeds), self.settings.restarts)
-        self._masks = [data.seeds.new_ones(len(data.seeds), 1, o, i, dtype=torch.bool) for i, o in pairwise(sizes)]
-        weights = _nguyen_widrow(sizes, data.seeds, self.settings.restarts)
-        self._problem = pose_refinement(
-            self._masks,
-            weights,
-            data.inputs.unsqueeze(1),
-            data.targets.unsqueeze(1),
-            data.weights.unsqueeze(1),
-            None if data.metric is None else data.metric.unsqueeze(1),
-        )
+        restarts = self.settings.restarts
+        self._leading = (len(data.seeds), restarts)
+        weights = _nguyen_widrow(sizes, data.seeds, restarts)
+        self._masks = [
+            data.seeds.new_ones(len(layer), o, i, dtype=torch.bool)
+            for layer, (i, o) in zip(weights, pairwise(sizes), strict=True)
+        ]
+        rows = (data.inputs, data.targets, data.weights, data.metric)
+        rows = mapped(lambda part: part.repeat_interleave(restarts, 0), rows)
+        self._problem = pose_refinement(self._masks, weights, *rows)
         self._state = start_refinement(self._problem, weights)
         # Of each network, `r * restarts`.
         self._evidence = torch.full_like(self._state.damping, -torch.inf)
@@ -169,17 +168,18 @@ class BPLM(OneNetwork):
 
     def _model(self) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of the model, `r x 1 x ...`."""
-        return self._masks, [layer.unsqueeze(1) for layer in self._problem.network.split(self._best)]
+        masks = [mask[: len(self._best), None] for mask in self._masks]
+        return masks, [layer.unsqueeze(1) for layer in self._problem.network.split(self._best)]
 
 
 def _nguyen_widrow(sizes: tuple[int, ...], seeds: Tensor, restarts: int) -> list[Tensor]:
-    """First weights, one a layer, `r x restarts x out x (in + 1)` with the biases last."""
+    """First weights, one a layer, `(r restarts) x out x (in + 1)` with the biases last."""
     shapes = [(out, into + 1) for into, out in pairwise(sizes)]
     draws = 2 * uniform(seeds, _STARTS, 0, (restarts, sum(out * width for out, width in shapes))) - 1
     parts = torch.split(draws, [out * width for out, width in shapes], dim=-1)
     layers = []
     for number, (part, (out, width)) in enumerate(zip(parts, shapes, strict=True)):
-        drawn = part.reshape(len(seeds), restarts, out, width)
+        drawn = part.reshape(-1, out, width)
         if number == len(shapes) - 1:
             layers.append(drawn / 2)
             continue

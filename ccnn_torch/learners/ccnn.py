@@ -10,14 +10,14 @@ from torch import Tensor
 
 from ccnn_torch.evolution.coevolution import REPRESENTATIVES, density, diversity, make_task
 from ccnn_torch.evolution.masked_network import MaskedNetwork, Spread, readout_spread, spread_variance
-from ccnn_torch.evolution.network import averaged, forward, without_waves
+from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import member_seeds
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Harmonics, Waves, fit_harmonics, harmonic_count
 from ccnn_torch.learners.protocol import TrainingData, weighted_mse
 from ccnn_torch.learners.rows import thinned
 from ccnn_torch.learners.structure import MemberRows, Structure
-from ccnn_torch.numerics.trees import below
+from ccnn_torch.numerics.trees import below, mapped
 
 # A training with rows held out, which chooses the number of steps, has one in so many of a refinement's iterations; the
 # one on all rows goes on from its networks with the others.
@@ -63,29 +63,21 @@ class CCNN:
             there = (data.weights > 0).unsqueeze(-1)
             left = data.targets - self._gears(data.inputs)
             data = replace(data, targets=torch.where(there, left, data.targets))
-        inputs, targets, weights = (
-            part.repeat_interleave(members, dim=0) for part in (data.inputs, data.targets, data.weights)
-        )
+        rows = (data.inputs, data.targets, data.weights, data.metric)
+        inputs, targets, weights, metric = mapped(lambda part: part.repeat_interleave(members, dim=0), rows)
         features = data.inputs.shape[-1]
         # Sigmoids read an angle by its sine and cosine; periodic nodes read the angle.
         self._features, read = features, features - data.angles
         readable = torch.ones(features, dtype=torch.bool, device=data.inputs.device)
         readable[read - 2 * data.angles : read] = False
-        rows = MemberRows(
-            inputs,
-            targets,
-            weights,
-            None if data.metric is None else data.metric.repeat_interleave(members, dim=0),
-            readable,
-            make_task(inputs[..., :read], targets, weights),
-            member_seeds(data.seeds, members).flatten(),
-        )
+        task = make_task(inputs[..., :read], targets, weights)
+        of_members = MemberRows(inputs, targets, weights, metric, task, member_seeds(data.seeds, members).flatten())
         self._data, self._phase = data, 0
         self._layers = settings.structures(targets.shape[-1])
         iterations = settings.refinement_iterations
         if data.validation is not None:
             iterations = math.ceil(iterations / _CHOOSING)
-        self._structures = [Structure(hidden, settings, rows, iterations) for hidden in self._layers]
+        self._structures = [Structure(hidden, settings, of_members, readable, iterations) for hidden in self._layers]
 
     def step(self) -> dict[str, Tensor]:
         """One generation, or one refinement or search after the last of them."""
@@ -134,14 +126,6 @@ class CCNN:
 
         variance = self._chosen([one(structure) for structure in self._structures])
         return variance if self._gears is None else variance + self._gears.variance(inputs)
-
-    def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`.
-
-        Its periodic nodes are left out.
-        """
-        plain = averaged(without_waves(self._structure(repeat).members()))
-        return [mask[repeat] for mask in plain.masks], [weight[repeat] for weight in plain.weights]
 
     def network(self, repeat: int) -> MaskedNetwork:
         """The model of one repeat, pruned of its dead nodes."""

@@ -13,6 +13,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ccnn_torch.numerics.blocks import in_blocks
+from ccnn_torch.numerics.trees import picked
+
 # Features are about [-1, 1]; further out nothing changes any more, and squares stay finite.
 FARTHEST = 1e6
 # Doubles of one block. On a CPU 4 MB stay in the cache (measured: twice as fast as 64 MB); an accelerator wants more.
@@ -83,24 +86,13 @@ def blocked_means(
     own: Tensor | None = None,
 ) -> KernelMeans:
     """`kernel_means` of many repeats, a block of repeats and queries at a time; all leading dimensions are `r`."""
-    repeats, count = queries.shape[:2]
-    stored, width = rows.shape[1:]
-    block = block_size(rows)
-    each = max(1, stored * (width + 3 * inverse_bandwidths.shape[1]))
-    columns = min(count, max(1, block // each))
-    side_by_side = max(1, block // (each * columns))
-    parts = []
-    for first in range(0, repeats, side_by_side):
-        here = slice(first, first + side_by_side)
-        fixed = (rows[here], log_weights[here], values[here], inverse_bandwidths[here])
-        pieces = [
-            kernel_means(
-                queries[here, start : start + columns], *fixed, None if own is None else own[start : start + columns]
-            )
-            for start in range(0, count, columns)
-        ]
-        parts.append(KernelMeans(*(torch.cat(kind, 2) for kind in zip(*pieces, strict=True))))
-    return KernelMeans(*(torch.cat(kind) for kind in zip(*parts, strict=True)))
+    fixed = (rows, log_weights, values, inverse_bandwidths)
+
+    def of(here: slice, some: slice) -> KernelMeans:
+        return kernel_means(queries[here, some], *picked(fixed, here), None if own is None else own[some])
+
+    each = max(1, rows.shape[1] * (rows.shape[2] + 3 * inverse_bandwidths.shape[1]))
+    return in_blocks(of, queries.shape[:2], each, block_size(rows), 2)
 
 
 # Rows' worth of belief in the overall variance: a few squared residuals scatter by a factor of several.

@@ -68,15 +68,11 @@ class OneNetwork(ABC):
         masks, weights = self._model()
         return spread_variance([m[:, 0] for m in masks], [w[:, 0] for w in weights], self._spread(), inputs)
 
-    def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`."""
-        masks, weights = self._model()
-        return [mask[repeat, 0] for mask in masks], [weight[repeat, 0] for weight in weights]
-
     def network(self, repeat: int) -> MaskedNetwork:
         """The model of one repeat, pruned of its dead nodes."""
+        masks, weights = ([part[repeat, 0] for part in parts] for parts in self._model())
         spread = self._spread()
-        return MaskedNetwork(*self.genome(repeat), spread.factors[repeat], spread.noise[repeat])
+        return MaskedNetwork(masks, weights, spread.factors[repeat], spread.noise[repeat])
 
     def _spread(self) -> Spread:
         return readout_spread(*self._model(), self._data.inputs, self._data.targets, self._data.weights)

@@ -35,7 +35,6 @@ class MemberRows(NamedTuple):
         targets: `b x s x o`.
         weights: `b x s`.
         metric: `b x s x c x o`, or None.
-        readable: which inputs periodic nodes may read, `i` bool.
         task: the same rows laid out for evolution.
         seeds: `b`.
     """
@@ -44,14 +43,8 @@ class MemberRows(NamedTuple):
     targets: Tensor
     weights: Tensor
     metric: Tensor | None
-    readable: Tensor
     task: Task
     seeds: Tensor
-
-    def of(self, index: Tensor) -> MemberRows:
-        """Those of some networks."""
-        rows = picked((self.inputs, self.targets, self.weights, self.metric, self.task, self.seeds), index)
-        return MemberRows(*rows[:4], self.readable, *rows[4:])
 
 
 class Structure:
@@ -61,8 +54,11 @@ class Structure:
     get periodic nodes, in several searches, and are refined again after each. The model is the mean of these members.
     """
 
-    def __init__(self, hidden: tuple[int, ...], settings: CCNNSettings, rows: MemberRows, iterations: int) -> None:
-        self.settings, self.rows, self.iterations = settings, rows, iterations
+    def __init__(
+        self, hidden: tuple[int, ...], settings: CCNNSettings, rows: MemberRows, readable: Tensor, iterations: int
+    ) -> None:
+        """readable: which inputs periodic nodes may read, `i` bool; iterations: of a refinement."""
+        self.settings, self.rows, self.readable, self.iterations = settings, rows, readable, iterations
         self.slots = settings.waves if settings.refinement_iterations else 0
         self.kept = min(settings.kept, settings.members) if settings.refinement_iterations else settings.members
         inputs, outputs = rows.task.inputs.shape[1], rows.targets.shape[-1]
@@ -118,14 +114,14 @@ class Structure:
             return
         best = self._best()
         index = best.flatten()
-        rows, model = self.rows.of(index), picked(self.refined, index)
+        rows, model = picked((self.rows, self.refined), index)
         each = best.shape[1]
         first = slice(None, None, each)
         left = rows.targets - forward(model.masks, model.weights, rows.inputs, model.waves)
         left = left.unflatten(0, (-1, each)).mean(1)  # type: ignore[no-untyped-call]
         # The members of a repeat share their slots; only the frequencies were refined apart.
         before = picked(model.waves, first)
-        found = find_waves(before, left, rows.inputs[first], rows.weights[first], rows.readable, _PASSES)
+        found = find_waves(before, left, rows.inputs[first], rows.weights[first], self.readable, _PASSES)
         fresh = ((found.frequency != 0) & (before.frequency == 0)).repeat_interleave(each, 0)
         going = torch.nonzero(fresh.any(-1)).flatten()
         if len(going) == 0:
@@ -230,7 +226,7 @@ class Structure:
         self, model: Bundle, index: Tensor, known: Precisions | None
     ) -> tuple[Bundle, Tensor, Precisions]:
         """The same of as many networks as the budget of memory holds."""
-        rows = self.rows.of(index)
+        rows = picked(self.rows, index)
         outputs = rows.targets.shape[-1]
         # Slots are filled from the first on: those that are free in every network need not be carried along.
         used = int((model.waves.frequency != 0).sum(-1).max()) if self.slots else 0
@@ -248,7 +244,7 @@ class Structure:
         )
         # Networks that were done earlier made fewer iterations; this counts those of the last one.
         self.passes = self.passes.index_add(
-            0, index, torch.full_like(refined.error, refined.iterations * (outputs + 1))
+            0, index, torch.full_like(refined.log_evidence, refined.iterations * (outputs + 1))
         )
         found = refined.precisions
         found = found._replace(prior=resized_prior(found.prior, outputs, used, self.slots))

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ccnn_torch.motion.compilable import is_compiled
 from ccnn_torch.motion.course import course, courses
-from ccnn_torch.motion.stage import ABSENT, TINY, Axis, Given, axis_of
+from ccnn_torch.motion.stage import ABSENT, TINY, Given, axis_of
 from ccnn_torch.motion.stretches import PLACES, START
 
 Array = NDArray[np.float64]
@@ -42,8 +42,7 @@ class Drive(NamedTuple):
     Attributes:
         time: `b x s` [s], increasing, also in the padding.
         command: `b x s` [rad or m].
-        start: position and speed of the first sample, and its acceleration where it does not begin at rest, `b x 2` or
-            `b x 3`; or all of `START`, where it begins within a log.
+        start: position and speed of the first sample, `b x 2`; or all of `START`, where it begins within a log.
         supply: supply voltage over the nominal one, less 1, `b x s`; None = 0.
         warm: temperature less that of the coldest sample, `b x s` [K]; None = 0.
         torque: what else resists the motor, over the nominal gain, `b x s` [rad or m].
@@ -114,10 +113,10 @@ def simulate_axes(
         [np.interp(time[k] - d, time[k], command[j]) for k, j, d in zip(row, run, a.delay[own], strict=True)]
     )
     u, step = late * (1 + a.ratio[own, None]) + a.offset[own, None], np.diff(time)
-    found, axis = np.empty((len(run), s)), axis_of(a)
+    found = np.empty((len(run), s))
     for many in np.unique(parts):
         here = np.flatnonzero(parts == many)
-        some = Axis(*(v[own[here]] for v in axis))
+        some = axis_of(Given(*given[own[here]].T))
         has_any = Given(*has[own[here]].any(0).tolist())
         one, begin, bend, resists, volts, heat = (
             v[run[here] % len(v)].T for v in (step, start, bent, push, supply, warm)
@@ -131,10 +130,9 @@ def _start_of(drive: Drive) -> Array:
     start = drive.start.numpy()
     if start.shape[1] == len(START):
         return start
-    found, (q, v) = np.zeros((len(start), len(START))), start[:, :2].T
+    found, (q, v) = np.zeros((len(start), len(START))), start.T
     torque = 0.0 if drive.torque is None else drive.torque[np.arange(len(start)) % len(drive.torque), 0].numpy()
-    faster = start[:, 2] if start.shape[1] > 2 else 0.0
-    means = (faster, v, np.sign(v), drive.command[:, 0].numpy(), q, torque)
+    means = (0.0, v, np.sign(v), drive.command[:, 0].numpy(), q, torque)
     for k, value in enumerate((q, v, *[q] * PLACES, *means)):
         found[:, k] = value
     return found

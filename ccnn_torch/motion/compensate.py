@@ -54,19 +54,21 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
         refuse_time(table, rows, time[rows])
         if len(rows) < _FEWEST:
             raise InputError(f"{name}: {len(rows)} rows are no motion; give at least {_FEWEST}")
-        here = _of_rows(around, rows)
-        own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], here, found.errors)
+        own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], around.at(rows), found.errors)
         _refuse_absurd(model, name, found, wanted[rows], own.plain)
         command[rows], position[rows], plain[rows] = own.command, own.position, own.plain
-    # What the model leaves stays, and adds to what the correction does.
-    before, after = (np.hypot(np.sqrt(np.square(wanted - q).mean(0)), found.left) for q in (plain, position))
+
+    def errs(q: Array) -> Array:
+        # What the model leaves stays, and adds to what the correction does.
+        return np.asarray(np.hypot(np.sqrt(np.square(wanted - q).mean(0)), found.left))
+
+    before, after = errs(plain), errs(position)
     useless = after > (1 - _GAINED) * before
     if useless.any():
         command[:, useless] = wanted[:, useless]
         for _, rows in runs:
-            here = _of_rows(around, rows)
-            position[rows] = moved(found.nominal, found.axes, time[rows], command[rows][None], here)[0]
-        after = np.hypot(np.sqrt(np.square(wanted - position).mean(0)), found.left)
+            position[rows] = moved(found.nominal, found.axes, time[rows], command[rows][None], around.at(rows))[0]
+        after = errs(position)
     added: dict[str, Array | list[str]] = {}
     for what, values in (("corrected", command), ("predicted", position)):
         for i, name in enumerate(names):
@@ -115,10 +117,6 @@ def _around(found: Identified, table: Table) -> tuple[Around, list[str]]:
     if warm is not None:
         warm = warm - (float(warm[0]) if found.temperature is None else found.temperature)
     return Around(supply, warm), said
-
-
-def _of_rows(around: Around, rows: NDArray[np.int64]) -> Around:
-    return Around(*(None if own is None else own[rows] for own in around))
 
 
 def _begun(name: str, time: Array, wanted: Array) -> list[str]:

@@ -42,7 +42,7 @@ def course(
     if has.derivative:
         u = _led(axis, step, u)
     state = begun(axis, start, push[0])
-    found, driven = np.empty_like(u), axis.at_motor > 0
+    found, driven = np.empty_like(u), axis.own.encoder_at_motor > 0
     found[0] = pick(driven, state.q, state.x)
     for k in range(len(step)):
         after, late = min(k + 1, len(push) - 1), min(k + 1, len(supply) - 1)
@@ -69,7 +69,7 @@ def course(
     if has.play_loaded:
         hung = _hung(axis, step, found, push)
         for k in range(len(hung)):
-            behind[k] = pick(axis.play_loaded > 0, hung[k], behind[k])
+            behind[k] = pick(axis.own.play_loaded > 0, hung[k], behind[k])
     return behind
 
 
@@ -82,10 +82,10 @@ def _limited(axis: Axis, step: Array, u: Array, q: Array, v: Array, push: Array)
     where that moves.
     """
     load = axis.weight * np.sin(q + axis.hang) + (axis.viscous - axis.damping) * v + push
-    slow, ramped = (axis.slowness > 0) | (axis.ramp > 0), axis.ramp > 0
-    fastest, most = 1 / np.maximum(axis.slowness, TINY), 1 / np.maximum(axis.ramp, TINY)
+    slow, ramped = (axis.own.slowness > 0) | (axis.own.ramp > 0), axis.own.ramp > 0
+    fastest, most = 1 / np.maximum(axis.own.slowness, TINY), 1 / np.maximum(axis.own.ramp, TINY)
     found = u.copy()
-    found[0] = pick(slow, q + load / np.maximum(axis.gain, TINY), u[0])
+    found[0] = pick(slow, q + load / np.maximum(axis.own.gain, TINY), u[0])
     # No faster than it could brake.
     begin, reach = (u[1] - u[0]) / step[0], np.sqrt(2 * most * np.abs(u[0] - found[0]))
     pace = begin + within(v - begin, reach)
@@ -113,10 +113,10 @@ def _led(axis: Axis, step: Array, u: Array) -> Array:
     for k in range(len(u)):
         a, b = max(k - 1, 0), min(k, last)
         between = step[b] if a == b else step[a] + step[b]
-        now = axis.derivative * (u[b + 1] - u[a]) / between
-        fades = 0.5 * axis.integral * step[a]
+        now = axis.own.derivative * (u[b + 1] - u[a]) / between
+        fades = 0.5 * axis.own.integral * step[a]
         faded = (lead * (1 - fades) + now - before) / (1 + fades)
-        lead = pick((axis.integral > 0) & (k > 0), faded, now)
+        lead = pick((axis.own.integral > 0) & (k > 0), faded, now)
         before = now
         found[k] = u[k] + lead
     return found
@@ -136,7 +136,7 @@ def _bend(u: Array, k: int) -> Array:
 @compilable
 def _played(axis: Axis, q: Array) -> Array:
     """The driven side of a play, which rests in the middle at first."""
-    found, half = q.copy(), 0.5 * axis.play
+    found, half = q.copy(), 0.5 * axis.own.play
     for k in range(1, len(q)):
         found[k] = np.maximum(np.minimum(found[k - 1], q[k] + half), q[k] - half)
     return found
@@ -145,7 +145,7 @@ def _played(axis: Axis, q: Array) -> Array:
 @compilable
 def _hung(axis: Axis, step: Array, q: Array, push: Array) -> Array:
     """The driven side of a play, which is free between its ends but for its friction, and does not bounce there."""
-    found, half, fall = q.copy(), 0.5 * axis.play, axis.weight * axis.light
+    found, half, fall = q.copy(), 0.5 * axis.own.play, axis.weight * axis.light
     x = q[0] - half * np.sign(fall * np.sin(q[0] + axis.hang) + push[0] * axis.light)
     v = 0.0 * x
     found[0] = x
@@ -153,7 +153,7 @@ def _hung(axis: Axis, step: Array, q: Array, push: Array) -> Array:
         h = step[k]
         v = v - h * (fall * np.sin(x + axis.hang) + push[min(k, len(push) - 1)] * axis.light)
         # Its bearing brakes it, up to standstill.
-        v = np.sign(v) * np.maximum(np.abs(v) - h * axis.play_friction, 0.0)
+        v = np.sign(v) * np.maximum(np.abs(v) - h * axis.own.play_friction, 0.0)
         free = x + h * v
         x = np.minimum(np.maximum(free, q[k + 1] - half), q[k + 1] + half)
         v = pick(x == free, v, (q[k + 1] - q[k]) / h)
@@ -198,13 +198,13 @@ def courses(
         b, axis = run[j], axis_of(Given(*fixed_tuple(given[own[j]], _PARAMETERS)))
         times, asked, i = time[b % len(time)], command[b], 0
         for k in range(count):
-            t = times[k] - axis.delay
+            t = times[k] - axis.own.delay
             while i < count - 1 and times[i + 1] <= t:
                 i += 1
             late = asked[i]
             if times[i] < t and i < count - 1:
                 late += (asked[i + 1] - late) / (times[i + 1] - times[i]) * (t - times[i])
-            u[k] = late * (1 + axis.ratio) + axis.offset
+            u[k] = late * (1 + axis.own.ratio) + axis.own.offset
             if k > 0:
                 step[k - 1] = times[k] - times[k - 1]
         pushed, volts, heat = push[b % len(push)], supply[b % len(supply)], warm[b % len(warm)]

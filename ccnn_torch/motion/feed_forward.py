@@ -45,6 +45,10 @@ class Around(NamedTuple):
     supply: Array | None = None
     warm: Array | None = None
 
+    def at(self, rows: NDArray[np.int64] | slice) -> Around:
+        """The same of some samples."""
+        return Around(*(None if own is None else own[rows] for own in self))
+
 
 AS_USUAL = Around()
 
@@ -209,10 +213,9 @@ def _standing(
 ) -> Array:
     """The command at which a machine stands where it is wanted, `n`."""
     command = wanted.copy()
-    begins = Around(*(None if own is None else own[:2] for own in around))
     for _ in range(_STANDING):
         held = np.broadcast_to(command, (1, 2, len(command)))
-        command = command + wanted - moved(nominal, axes, time[:2], held, begins)[0, 0]
+        command = command + wanted - moved(nominal, axes, time[:2], held, around.at(slice(2)))[0, 0]
     return command
 
 

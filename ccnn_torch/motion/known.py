@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import nearest_hint
 from ccnn_torch.units import amount
 
 TIME, _WEIGHT = "time", ("gravity_sin", "gravity_cos")
@@ -36,9 +36,9 @@ def shares_of(exact: Sequence[str] = (), known: Mapping[str, float | str] | None
     names = [*OF, TIME]
     for place, key in [*(("exact", key) for key in exact), *(("known", key) for key in known or {})]:
         if key not in names:
-            near = nearest(key, names)
-            hint = f"; '{near}' is the nearest" if near else ""
-            raise InputError(f"{place}: there is no value '{key}'{hint}; there are {', '.join(names)}")
+            raise InputError(
+                f"{place}: there is no value '{key}'{nearest_hint(key, names)}; there are {', '.join(names)}"
+            )
     found = dict.fromkeys(exact, 0.0)
     for key, value in (known or {}).items():
         if key in found:

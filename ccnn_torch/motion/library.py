@@ -18,7 +18,7 @@ from ccnn_torch.motion.effects.protocol import Act
 from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.plugins import users_code
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import nearest_hint
 
 # What may not be below 0, and what not above.
 _POSITIVE = (
@@ -177,8 +177,7 @@ def _breaches(missing: object, numbers: Sequence[object], shapes: Any) -> Iterat
         for act in number.acts:
             fine = isinstance(act, Act) and act.how in ("add", "factor") and is_number(act.factor)
             if not fine or not (act.parameter in ABSENT or act.parameter == CARRIED or act.parameter.startswith(OWN)):
-                near = nearest(act.parameter, list(ABSENT)) if isinstance(act, Act) else None
-                hint = f"; '{near}' is the nearest" if near else ""
+                hint = nearest_hint(act.parameter, [*ABSENT]) if isinstance(act, Act) else ""
                 yield f"'{number.name}' acts by {act!r}, which is on no parameter of an axis{hint}"
     if not isinstance(shapes, Sequence) or not shapes or not all(isinstance(s, Mapping) for s in shapes):
         yield f"shapes must return at least one dict, which may be empty, not {shapes!r}"

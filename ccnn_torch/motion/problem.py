@@ -65,11 +65,8 @@ class Problem:
     @cached_property
     def _start(self) -> Tensor:
         data = self.data
-        q, v = data.position[:, :, 0], data.speed[:, :, 0]
-        if data.begin is None:
-            faster = (data.speed[:, :, 2] - v) / (data.time[:, 2] - data.time[:, 0])
-            return torch.stack([q, v, faster], -1)
-        return torch.cat([torch.stack([q, v], -1), data.begin], -1)
+        start = torch.stack([data.position[:, :, 0], data.speed[:, :, 0]], -1)
+        return start if data.begin is None else torch.cat([start, data.begin], -1)
 
     def positions(self, theta: Tensor, axis: Tensor) -> Tensor:
         """Simulated positions of models of axes.

@@ -9,7 +9,7 @@ from typing import Any
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.stage import ABSENT
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import nearest_hint
 from ccnn_torch.units import STANDARD_GRAVITY
 
 KEYS: dict[str, str] = {
@@ -72,10 +72,8 @@ def servo(keys: Mapping[str, Any], n: int) -> Nominal:
     """
     for key in keys:
         if key not in KEYS:
-            near = nearest(key, list(KEYS))
             raise InputError(
-                f"mechanism_keys: the servo has no key '{key}'"
-                f"{f'; {near!r} is the nearest' if near else ''}; it has {', '.join(KEYS)}"
+                f"mechanism_keys: the servo has no key '{key}'{nearest_hint(key, [*KEYS])}; it has {', '.join(KEYS)}"
             )
     each = {key: _numbers(key, value, n) for key, value in keys.items()}
     axes, gains, lengths, masses = [], [], [], []

@@ -75,9 +75,11 @@ ABSENT: dict[str, float] = Given()._asdict()
 
 
 class Axis(NamedTuple):
-    """Parameters of axes, as in `Given`, and what follows from them.
+    """Parameters of axes, and what follows from them.
 
     Attributes:
+        own: the parameters.
+        viscous, drive_damping: with what the derivative gain adds.
         weight, hang, wave, phase: sizes and phases of the weight and the cogging: a sine and a cosine of one angle are
             one sine, which is what costs time here.
         limit: of the motor's torque at standstill.
@@ -85,24 +87,13 @@ class Axis(NamedTuple):
         inertia: of the motor's side where a load hangs on a spring.
         hung: 1 where it does: a load of no inertia does not pull at the motor, and its weight stays there.
         stiffness, slack, drag: of that spring, one over it, and its damping over it.
-        whole: inertia of motor and load.
         damping: part of `viscous` and `drive_damping` that the derivative gain makes.
         light: one over the inertia behind a play.
     """
 
-    gain: Array
-    integral: Array
+    own: Given
     viscous: Array
     drive_damping: Array
-    coulomb: Array
-    load_friction: Array
-    stribeck: Array
-    stribeck_speed: Array
-    thermal: Array
-    supply: Array
-    order: Array
-    flexibility: Array
-    at_motor: Array
     weight: Array
     hang: Array
     wave: Array
@@ -114,18 +105,7 @@ class Axis(NamedTuple):
     stiffness: Array
     slack: Array
     drag: Array
-    whole: Array
-    dead_band: Array
-    delay: Array
-    offset: Array
-    ratio: Array
-    slowness: Array
-    ramp: Array
-    derivative: Array
     damping: Array
-    play: Array
-    play_loaded: Array
-    play_friction: Array
     light: Array
 
 
@@ -199,19 +179,9 @@ def axis_of(a: Given) -> Axis:
     # Half of what a derivative gain does resists the speed, within the limit of the motor.
     damping = a.gain * a.derivative
     return Axis(
-        gain=a.gain,
-        integral=a.integral,
+        own=a,
         viscous=a.viscous + damping,
         drive_damping=a.drive_damping + damping,
-        coulomb=a.coulomb,
-        load_friction=a.load_friction,
-        stribeck=a.stribeck,
-        stribeck_speed=a.stribeck_speed,
-        thermal=a.thermal,
-        supply=a.supply,
-        order=a.cogging_order,
-        flexibility=a.flexibility,
-        at_motor=a.encoder_at_motor,
         weight=weight,
         hang=hang,
         wave=wave,
@@ -223,18 +193,7 @@ def axis_of(a: Given) -> Axis:
         stiffness=stiffness,
         slack=hung / np.maximum(stiffness, TINY),
         drag=2 * a.flexible_damping * np.sqrt(np.maximum(a.flexibility, 0.0)),
-        whole=a.inertia,
-        dead_band=a.dead_band,
-        delay=a.delay,
-        offset=a.offset,
-        ratio=a.ratio,
-        slowness=a.slowness,
-        ramp=a.ramp,
-        derivative=a.derivative,
         damping=damping,
-        play=a.play,
-        play_loaded=a.play_loaded,
-        play_friction=a.play_friction,
         light=pick(load > 0, 1 / np.maximum(load, TINY), 0.0 * load),
     )
 
@@ -247,16 +206,23 @@ def begun(axis: Axis, start: Array, push: Array) -> State:
     sag = axis.slack * (axis.weight * np.sin(q + axis.hang) + push)
     for k in range(2, 10):
         load = (
-            load + axis.weight * np.sin(start[k] + axis.hang) + axis.wave * np.sin(axis.order * start[k] + axis.phase)
+            load
+            + axis.weight * np.sin(start[k] + axis.hang)
+            + axis.wave * np.sin(axis.own.cogging_order * start[k] + axis.phase)
         )
-    load = load / 8 + axis.whole * start[10] + (axis.viscous - axis.damping) * start[11] + axis.coulomb * start[12]
-    added = start[16] + (axis.offset + axis.ratio * start[13]) * start[17] - axis.delay * start[18]
+    load = (
+        load / 8
+        + axis.own.inertia * start[10]
+        + (axis.viscous - axis.damping) * start[11]
+        + axis.own.coulomb * start[12]
+    )
+    added = start[16] + (axis.own.offset + axis.own.ratio * start[13]) * start[17] - axis.own.delay * start[18]
     # What is integrated too slowly for that holds nothing.
-    held = 1 - np.exp(-_STOOD * axis.integral)
-    held = held * (load + start[15] - axis.gain * ((1 + axis.ratio) * start[13] + axis.offset - start[14]))
-    held = held + axis.gain * axis.integral * added
-    held = pick(axis.integral > 0, within(held, axis.limit), 0.0 * q)
-    at_motor = axis.at_motor > 0
+    held = 1 - np.exp(-_STOOD * axis.own.integral)
+    held = held * (load + start[15] - axis.own.gain * ((1 + axis.own.ratio) * start[13] + axis.own.offset - start[14]))
+    held = held + axis.own.gain * axis.own.integral * added
+    held = pick(axis.own.integral > 0, within(held, axis.limit), 0.0 * q)
+    at_motor = axis.own.encoder_at_motor > 0
     return State(pick(at_motor, q, q + sag), v, pick(at_motor, q - sag, q), v, held)
 
 
@@ -285,15 +251,15 @@ def advanced(axis: Axis, has: Given, state: State, given: Sample, parts: int) ->
 @compilable
 def _fixed(axis: Axis, has: Given, given: Sample, parts: int) -> _Fixed:
     """What all stages of a sample have in common."""
-    h, strength = given.step * (GAMMA / parts), np.maximum(1 + axis.supply * given.supply, 0.0)
-    dry = axis.coulomb * np.maximum(1 + axis.thermal * given.warm, 0.0)
-    gain, limit, mass = axis.gain * strength, axis.limit * strength, axis.inertia / h
+    h, strength = given.step * (GAMMA / parts), np.maximum(1 + axis.own.supply * given.supply, 0.0)
+    dry = axis.own.coulomb * np.maximum(1 + axis.own.thermal * given.warm, 0.0)
+    gain, limit, mass = axis.own.gain * strength, axis.limit * strength, axis.inertia / h
     light, over, drag, follows = mass + axis.viscous, h, h, h
     if has.flexibility:
-        over, drag = axis.flexibility / h, h + axis.drag
+        over, drag = axis.own.flexibility / h, h + axis.drag
         follows = drag / (over + drag)
         light = light + axis.stiffness * drag * (1 - follows)
-    rate = gain * axis.integral
+    rate = gain * axis.own.integral
     gain = gain + rate * h
     return _Fixed(h, gain, rate, limit, dry, mass, np.maximum(light, TINY), gain * h, over, drag, follows)
 
@@ -310,7 +276,7 @@ def _pulling(axis: Axis, has: Given, q: Array, push: Array) -> Array:
 def _error(axis: Axis, has: Given, error: Array) -> Array:
     """What the drive makes of an error: nothing within its dead band."""
     if has.dead_band:
-        return error - within(error, axis.dead_band)
+        return error - within(error, axis.own.dead_band)
     return error
 
 
@@ -321,7 +287,7 @@ def _stage(axis: Axis, has: Given, fixed: _Fixed, state: State, u: Array, push: 
     motor, stiff = fixed.gain * _error(axis, has, u - q) + held, fixed.stiff
     if has.dead_band:
         # Within it nothing resists; an axis without a mass goes on as if something did.
-        stiff = pick((np.abs(u - q) < axis.dead_band) & (fixed.mass > 0), 0.0 * stiff, stiff)
+        stiff = pick((np.abs(u - q) < axis.own.dead_band) & (fixed.mass > 0), 0.0 * stiff, stiff)
     # What the gear carries beside the motor's torque.
     carried = _pulling(axis, has, q, push)
     against, loose = carried, q
@@ -336,16 +302,16 @@ def _stage(axis: Axis, has: Given, fixed: _Fixed, state: State, u: Array, push: 
     if has.cogging_sin or has.cogging_cos:
         # Linearised, and no steeper than a stage can follow, the less so the more of a wave it passes without a mass:
         # else the last digit would decide where it goes.
-        passed = np.square(axis.order * h * v)
+        passed = np.square(axis.own.cogging_order * h * v)
         steepest = _STEEP * (light - fixed.mass + stiff) / (1.0 + passed) + _SWINGING * fixed.mass
-        wave = np.minimum(axis.wave * axis.order, steepest / h)
-        free = free - wave / axis.order * np.sin(axis.order * q + axis.phase)
-        light = light + h * wave * np.cos(axis.order * q + axis.phase)
+        wave = np.minimum(axis.wave * axis.own.cogging_order, steepest / h)
+        free = free - wave / axis.own.cogging_order * np.sin(axis.own.cogging_order * q + axis.phase)
+        light = light + h * wave * np.cos(axis.own.cogging_order * q + axis.phase)
     friction = fixed.dry
     if has.stribeck:
         # It falls with the speed of the stage before, no steeper than that an axis without mass forgets it.
-        least = _STEEPEST * axis.stribeck / (_STEEP * (light - fixed.mass + stiff) + fixed.mass)
-        friction = friction + axis.stribeck * np.exp(-np.square(v / np.maximum(axis.stribeck_speed, least)))
+        least = _STEEPEST * axis.own.stribeck / (_STEEP * (light - fixed.mass + stiff) + fixed.mass)
+        friction = friction + axis.own.stribeck * np.exp(-np.square(v / np.maximum(axis.own.stribeck_speed, least)))
     speed = _solved(axis, has, free, motor, friction, carried, light, stiff)
     if has.weakness:
         # The part of the damping that the drive makes is within its limit, which falls with the speed.
@@ -373,8 +339,8 @@ def _solved(
     resistance, push = light + stiff, free + motor
     if has.load_friction:
         load = motor + carried
-        friction = friction + axis.load_friction * np.abs(load)
-        resistance = resistance - axis.load_friction * stiff * np.sign(push * load)
+        friction = friction + axis.own.load_friction * np.abs(load)
+        resistance = resistance - axis.own.load_friction * stiff * np.sign(push * load)
     if has.coulomb or has.load_friction or has.stribeck:
         push = push - within(push, friction)
     return push / resistance

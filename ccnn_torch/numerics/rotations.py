@@ -17,6 +17,13 @@ from torch import Tensor
 _SMALL = 1e-9
 
 
+def homogeneous(rotation: Tensor, place: Tensor) -> Tensor:
+    """`... x 4 x 4` of a rotation `... x 3 x 3` and a place `... x 3`."""
+    whole = rotation.new_zeros(*rotation.shape[:-2], 4, 4)
+    whole[..., :3, :3], whole[..., :3, 3], whole[..., 3, 3] = rotation, place, 1.0
+    return whole
+
+
 def rotation_vector_to_matrix(vector: Tensor) -> Tensor:
     """vector: `... x 3` [rad]; returns `... x 3 x 3` (Rodrigues): I + sin θ/θ K + (1 - cos θ)/θ² K²."""
     square = vector.square().sum(-1)[..., None, None]

@@ -15,6 +15,7 @@ from ccnn_torch.evolution.genome import active
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import TrainingData
 from ccnn_torch.learners.ccnn import CCNN
+from ccnn_torch.numerics.trees import picked
 from ccnn_torch.training import Scaling
 
 SMALL = CCNNSettings(hidden=(4, 3), population=20, generations=12, density=0.7, members=1, refinement_iterations=0)
@@ -171,7 +172,7 @@ def test_several_members_make_one_model() -> None:
     data = toy_data([1, 2])
     learner = CCNN(replace(SMALL, members=3))
     history = train(learner, data)
-    masks, weights = learner.genome(1)
+    masks, weights, _ = picked(learner._structure(1).model(), 1)
     assert [tuple(mask.shape) for mask in masks] == [(12, 2), (9, 12), (2, 9)]
     assert torch.allclose(forward(masks, weights, data.inputs[1]), learner.predict(data.inputs)[1], rtol=0, atol=1e-13)
     assert history[0]["fitness_best"].shape == (2,) and history[0]["density"].shape == (2, 3)
@@ -192,7 +193,7 @@ def test_the_network_is_pruned_and_equal() -> None:
     data = toy_data([1, 2])
     train(learner, data)
     for k in range(2):
-        masks, weights = learner.genome(k)
+        masks, weights, _ = picked(learner._structure(k).model(), k)
         plain = forward(masks, weights, data.inputs[k])
         assert torch.allclose(plain, learner.predict(data.inputs)[k], rtol=0, atol=1e-13)
         assert torch.allclose(learner.network(k)(data.inputs[k]), learner.predict(data.inputs)[k], rtol=0, atol=1e-13)

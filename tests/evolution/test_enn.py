@@ -23,6 +23,7 @@ from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import ENNSettings
 from ccnn_torch.learners import TrainingData
 from ccnn_torch.learners.enn import ENN
+from ccnn_torch.numerics.blocks import memory_budget
 
 SMALL = ENNSettings(hidden=(4, 3), population=24, generations=15, density=0.6)
 
@@ -43,16 +44,17 @@ def history_of(learner: ENN, data: TrainingData) -> list[dict[str, Tensor]]:
     return history
 
 
-@pytest.mark.parametrize("block", [None, 400])
+@pytest.mark.parametrize("most", [None, 10_000])
 @pytest.mark.parametrize(("hidden", "bias"), [([4, 3], True), ([5], False), ([], True)])
-def test_every_network_has_the_error_it_has_alone(hidden: list[int], bias: bool, block: int | None) -> None:
+def test_every_network_has_the_error_it_has_alone(hidden: list[int], bias: bool, most: int | None) -> None:
     data = toy_data([1, 2], rows=9)
     weights = data.weights.clone()
     weights[1, 7:] = 0
     generator = torch.Generator().manual_seed(5)
     layers = random_layers([2, *hidden, 2], (2, 6), 0.5, bias, generator)
     task = make_task(data.inputs, torch.where(weights.unsqueeze(-1) > 0, data.targets, torch.nan), weights)
-    found = network_errors(layers, task, block)
+    with memory_budget(most):
+        found = network_errors(layers, task)
     for repeat in range(2):
         rows = int(weights[repeat].sum())
         for one in range(6):

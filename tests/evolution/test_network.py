@@ -12,7 +12,8 @@ from reference_operators import decode
 from torch import Tensor
 
 from ccnn_torch.evolution import Genome, MaskedNetwork, alive_nodes, forward, prune
-from ccnn_torch.evolution.network import average, fed_nodes
+from ccnn_torch.evolution.network import Bundle, averaged, fed_nodes
+from ccnn_torch.evolution.waves import no_waves
 
 SIZES = st.sampled_from([[3, 6, 6, 3], [2, 4, 1], [3, 3], [4, 2, 3, 2, 2]])
 
@@ -52,7 +53,7 @@ def test_the_average_of_networks_is_one_network(
     masks, weights = parts(naive.random_layers(sizes, (2, members), density, bias, generator))
     inputs = 2 * torch.rand(2, 5, sizes[0], generator=generator, dtype=torch.float64) - 1
     expected = forward(masks, weights, inputs.unsqueeze(1)).mean(1)
-    wide_masks, wide_weights = average(masks, weights)
+    wide_masks, wide_weights, _ = averaged(Bundle(masks, weights, no_waves((2, members), 0, inputs)))
     assert [mask.shape[-2] for mask in wide_masks[:-1]] == [members * size for size in sizes[1:-1]]
     assert torch.allclose(forward(wide_masks, wide_weights, inputs), expected, rtol=0, atol=1e-13)
     if len(sizes) > 2:

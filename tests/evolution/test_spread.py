@@ -8,7 +8,8 @@ import torch
 
 from ccnn_torch.evolution import MaskedNetwork
 from ccnn_torch.evolution.masked_network import readout_spread, spread_variance
-from ccnn_torch.evolution.network import average, hidden_signal
+from ccnn_torch.evolution.network import Bundle, averaged, hidden_signal
+from ccnn_torch.evolution.waves import no_waves
 
 
 def _networks(
@@ -38,7 +39,7 @@ def test_the_module_the_batch_and_a_naive_twin_agree(members: int, hidden: tuple
     masks, weights = _networks(members, hidden, bias)
     inputs, targets, rows = _rows()
     spread = readout_spread(masks, weights, inputs, targets, rows)
-    wide_masks, wide_weights = average(masks, weights)
+    wide_masks, wide_weights, _ = averaged(Bundle(masks, weights, no_waves((2, members), 0, inputs)))
     new = torch.randn(2, 7, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     batched = spread_variance(wide_masks, wide_weights, spread, new)
     for repeat in range(2):

@@ -143,7 +143,7 @@ def test_angles_are_read_by_waves_alone() -> None:
     while not learner.finished:
         learner.step()
     assert learner.network(0).frequencies.round().tolist()[0] == [0, 0, 36]
-    assert learner.genome(0)[0][0].shape[-1] == 2
+    assert learner._structures[0].refined.masks[0].shape[-1] == 2
     assert torch.allclose(learner.network(0)(inputs[0]), learner.predict(inputs)[0], rtol=0, atol=1e-12)
     assert float((learner.predict(inputs) - targets).square().mean()) < 0.01
 

@@ -154,7 +154,7 @@ def promised(compensator: Compensator, form: Form, joints: Array, covariates: Ar
         "command": np.where(lost, clean, found.command),
         "deviation": np.where(lost, 0.0, found.deviation),
         "ideal": np.where(lost, clean, found.ideal),
-        "sd": np.where(lost, form.fallback_sd, sd),
+        "sd": np.where(lost, compensator.fallback_sd, sd),
         "status": found.status.numpy(),
         "ideal_status": found.ideal_status.numpy(),
     }

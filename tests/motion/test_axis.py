@@ -194,7 +194,7 @@ def test_an_axis_moves_the_same_beside_any_other() -> None:
 def test_compiled_or_not_an_axis_moves_the_same() -> None:
     time = torch.from_numpy(TIME).expand(2, -1)
     asked = torch.stack([torch.from_numpy(command(k, TIME)) for k in (0, 1)])
-    start = torch.stack([asked[:, 0], asked.new_tensor([0.0, 0.4]), asked.new_tensor([0.0, 2.0])], -1)
+    start = torch.stack([asked[:, 0], asked.new_tensor([0.0, 0.4])], -1)
     uneven = {"supply": 0.1 * torch.sin(time), "warm": 5 * time, "torque": 0.01 * torch.cos(time)}
     drive = Drive(time, asked, start, **uneven, bent=asked.new_tensor([0.0, 0.9]))
     generator = torch.Generator().manual_seed(0)

@@ -63,12 +63,7 @@ def load_machine(path: str | Path, *, allow_code: bool = False) -> Mechanism:
 
     Args, raises: as of `load_compensation`.
     """
-    model = load_compensation(path, allow_code=allow_code)
-    if model.machine is not None:
-        return model.machine.identified
-    mechanism = model.mechanism(allow_code)
-    identified = model.facts.get("machine", {}).get("identified")
-    return mechanism if identified is None else mechanism.with_nominal(torch.tensor(identified, dtype=torch.float64))
+    return load_compensation(path, allow_code=allow_code).identified(allow_code)
 
 
 def _diagnosed(path: Path, content: bytes, allow_code: bool) -> FoundMachine | None:

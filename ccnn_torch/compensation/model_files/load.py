@@ -362,6 +362,14 @@ class LoadedModel:
         with code_refused(f"{self.path}: its mechanism", allow_code):
             return mechanism_from_description(self.facts["mechanism"], allow_code=True)
 
+    def identified(self, allow_code: bool = False) -> Mechanism:
+        """The machine with identified parameters as its nominal ones, without effects; errors as of `mechanism`."""
+        if self.machine is not None:
+            return self.machine.identified
+        mechanism = self.mechanism(allow_code)
+        values = self.facts.get("machine", {}).get("identified")
+        return mechanism if values is None else mechanism.with_nominal(torch.tensor(values, dtype=torch.float64))
+
 
 def read_model(path: Path) -> bytes:
     """The file's bytes.

@@ -10,7 +10,17 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from ccnn_torch.compensation.programs.literals import LEAST, NUMBER, Array, Edit, Point, edited, masked, number_like
+from ccnn_torch.compensation.programs.literals import (
+    LEAST,
+    NUMBER,
+    Array,
+    Edit,
+    Point,
+    edited,
+    frame_of,
+    masked,
+    number_like,
+)
 from ccnn_torch.errors import InputError
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, nearest_euler
 
@@ -192,11 +202,8 @@ class GCode:
         return np.concatenate([place, np.degrees(near[::-1])])
 
     def _frame(self, numbers: Array) -> Array:
-        found = np.eye(4)
-        found[:3, 3] = 1e-3 * numbers[:3]
-        if len(numbers) > 3:
-            found[:3, :3] = euler_zyx_to_matrix(torch.from_numpy(np.radians(numbers[:2:-1].copy()))).numpy()
-        return found
+        angles = torch.from_numpy(np.radians(numbers[:2:-1].copy()))
+        return frame_of(numbers[:3], euler_zyx_to_matrix(angles).numpy() if len(numbers) > 3 else np.eye(3))
 
 
 def _code(text: str) -> str:

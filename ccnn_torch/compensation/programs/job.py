@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from ccnn_torch.compensation.job import ROWS, frames_of, nearest_measured
+from ccnn_torch.compensation.job import ROWS, frames_of, nearest_measured, nearest_turns
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.programs import G_CODE
 from ccnn_torch.compensation.programs.gcode import GCode
@@ -22,7 +22,7 @@ from ccnn_torch.files.read import read_bytes
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.branches import ROUNDED, arrives, follow
-from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
+from ccnn_torch.numerics.rotations import homogeneous, matrix_to_rotation_vector
 from ccnn_torch.records.joint_map import read_joint_map
 
 _LARGEST = 100_000_000
@@ -172,9 +172,7 @@ class Corrections:
                 if solved is None or there is None:
                     if guess is None:
                         guess = nearest_measured(machine, torch.from_numpy(self._loaded.region), pose)
-                    row = follow(machine, pose[None], guess, ROUNDED)[0]
-                    turning = torch.tensor([c.unit == "rad" for c in machine.joints])
-                    row = row - torch.where(turning, 2 * torch.pi * torch.round((row - guess) / (2 * torch.pi)), 0.0)
+                    row = nearest_turns(machine, follow(machine, pose[None], guess, ROUNDED)[0], guess)
                     reached = bool(arrives(machine, row, pose, ROUNDED))
                 else:
                     row, reached = solved[at[k]], bool(there[at[k]])
@@ -188,11 +186,8 @@ class Corrections:
         """Of the nominal machine, in the frame of the program, `s x 4 x 4`."""
         pose = self._machine.forward_kinematics(torch.from_numpy(np.asarray(joints)))
         position, rotation = self._machine.frame(pose)
-        found = np.broadcast_to(np.eye(4), (len(joints), 4, 4)).copy()
-        found[:, :3, 3] = position.numpy()
-        if rotation is not None:
-            found[:, :3, :3] = rotation.numpy()
-        return np.asarray(np.linalg.inv(self._base) @ found)
+        turned = torch.eye(3, dtype=position.dtype).expand(len(joints), 3, 3) if rotation is None else rotation
+        return np.asarray(np.linalg.inv(self._base) @ homogeneous(turned, position).numpy())
 
     def _own(self, joints: Array) -> Array:
         return joints if self._counted is None else self._counted.of_shown(joints)

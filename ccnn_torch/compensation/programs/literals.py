@@ -196,7 +196,7 @@ class Krl(Literals):
 
     @staticmethod
     def _frame(numbers: Sequence[float]) -> Array:
-        return _frame_of(numbers[:3], euler_zyx_to_matrix(torch.tensor(np.radians(numbers[3:]))).numpy())
+        return frame_of(numbers[:3], euler_zyx_to_matrix(torch.tensor(np.radians(numbers[3:]))).numpy())
 
 
 # Variables of the controller, and declarations of frames, which are bases and tools.
@@ -239,19 +239,18 @@ class Rapid(Literals):
 
     @staticmethod
     def _frame(numbers: Sequence[float]) -> Array:
-        w, x, y, z = np.array(numbers[3:]) / np.linalg.norm(numbers[3:])
-        turn = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return _frame_of(numbers[:3], np.array(turn))
+        # It takes a while to load, which other programs need not wait for.
+        from scipy.spatial.transform import Rotation
+
+        # There the scalar is the last one.
+        return frame_of(numbers[:3], Rotation.from_quat(np.roll(numbers[3:], -1)).as_matrix())
 
 
 _LIST = r"\[([^\[\]]*)\]"
 
 
-def _frame_of(place: Sequence[float], rotation: Array) -> Array:
+def frame_of(place: Sequence[float] | Array, rotation: Array) -> Array:
+    """The frame `4 x 4` [m] of a place [mm] and a rotation `3 x 3`."""
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = rotation, 1e-3 * np.array(place)
     return found

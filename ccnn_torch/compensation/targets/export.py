@@ -111,10 +111,8 @@ def _onnx(order: _Order) -> dict[str, bytes | str]:
 
 
 def _table(order: _Order, mesh: bool = True) -> dict[str, str]:
-    if order.model.machine is not None:
-        return print_tables(order.compensator(), order.model.machine.nominal, mesh)
     known = "spec" in order.model.facts["mechanism"]
-    return print_tables(order.compensator(), order.mechanism() if known else None, mesh)
+    return print_tables(order.compensator(), order.model.mechanism(order.allow_code) if known else None, mesh)
 
 
 def _ros2_control(order: _Order) -> Mapping[str, str]:
@@ -127,6 +125,11 @@ def _ros2_control(order: _Order) -> Mapping[str, str]:
     return print_ros2_control(*order.proven(), middle_of(found), said)
 
 
+def _numbers(make: Callable[[Found], Stack], title: str) -> Callable[[_Order], Mapping[str, str]]:
+    """The target of a stack that reads numbers of the machine alone."""
+    return lambda order: order.written(make, title)
+
+
 TARGETS: dict[str, Callable[[_Order], Mapping[str, str | bytes]]] = {
     "c99": lambda order: print_c99(*order.proven()),
     "st": lambda order: print_structured_text(*order.proven()),
@@ -135,13 +138,13 @@ TARGETS: dict[str, Callable[[_Order], Mapping[str, str | bytes]]] = {
     "ros2_control": _ros2_control,
     "table": _table,
     "beckhoff": lambda order: _table(order, mesh=False),
-    "urdf": lambda order: order.written(print_robot, "Links"),
-    "mjcf": lambda order: order.written(print_robot, "Links"),
-    "ur": lambda order: order.written(print_ur, "Kinematics"),
-    "pal": lambda order: order.written(print_pal, "Calibration"),
-    "klipper": lambda order: order.written(print_klipper, "Kinematics"),
-    "linuxcnc_hal": lambda order: order.written(print_hal, "Kinematics"),
-    "lerobot": lambda order: order.written(print_lerobot, "Calibration"),
+    "urdf": _numbers(print_robot, "Links"),
+    "mjcf": _numbers(print_robot, "Links"),
+    "ur": _numbers(print_ur, "Kinematics"),
+    "pal": _numbers(print_pal, "Calibration"),
+    "klipper": _numbers(print_klipper, "Kinematics"),
+    "linuxcnc_hal": _numbers(print_hal, "Kinematics"),
+    "lerobot": _numbers(print_lerobot, "Calibration"),
 }
 CURRENT = ("ur", "pal", "lerobot", "klipper", "ros2_control")
 """Those that take names or numbers from the user's own file."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -150,7 +151,6 @@ class Form:
         iterations: steps from the joints to their command.
         method: whose steps these are.
         limit: of the whole |deviation|, `n` [SI].
-        fallback_sd: standard deviation where the deviation is taken as 0, `n` [SI].
         dtype: `float64` or `float32`.
         programs: by name.
         routines: by name: `compensate`, `ideal`, and `deviation_sd` where it was asked for.
@@ -162,7 +162,6 @@ class Form:
     iterations: int
     method: str
     limit: Array
-    fallback_sd: Array
     dtype: str
     programs: dict[str, Program]
     routines: dict[str, Routine]
@@ -248,7 +247,7 @@ def put_loops_together(
             reader = by[0] if by else None
             # What is read twice is worked out twice then.
             if reader is not None and all(r is reader for r in by) and (len(by) == 1 or _is_cheap(step)):
-                put = _replaced(reader.expression, step, reader.shape)
+                put = _rewritten(reader.expression, partial(_replaced, step, reader.shape))
                 if put is not None:
                     for leaf in leaves(step.expression):
                         if isinstance(leaf, Leaf):
@@ -273,13 +272,18 @@ def merge_axes(loop: Loop) -> Loop:
             shape[axis + 1] *= shape[axis]
             _drop(shape, strides, axis)
             width -= 1
+    put = _rewritten(loop.expression, lambda leaf: leaf._replace(strides=tuple(strides[id(leaf)])))
+    return Loop(loop.buffer, tuple(shape), put, loop.reduce)
 
-    def put(part: Expression) -> Expression:
-        if isinstance(part, Leaf):
-            return Leaf(part.buffer, part.offset, tuple(strides[id(part)]))
-        return (part[0], *map(put, part[1:])) if isinstance(part, tuple) else part
 
-    return Loop(loop.buffer, tuple(shape), put(loop.expression), loop.reduce)
+def _rewritten(expression: Expression, change: Callable[[Leaf], Expression | None]) -> Expression | None:
+    """An expression with others in the places of its leaves; None where one of these is None."""
+    if isinstance(expression, Leaf):
+        return change(expression)
+    if not isinstance(expression, tuple):
+        return expression
+    parts = [_rewritten(part, change) for part in expression[1:]]
+    return None if None in parts else (expression[0], *parts)
 
 
 def _drop(shape: list[int], strides: dict[int, list[int]], axis: int) -> None:
@@ -311,34 +315,20 @@ def _is_cheap(loop: Loop) -> bool:
     )
 
 
-def _replaced(expression: Expression, inner: Loop, shape: tuple[int, ...]) -> Expression | None:
-    """The expression with another loop's in the place of its array; None where indices do not follow on."""
-    if isinstance(expression, Leaf):
-        if expression.buffer != inner.buffer:
-            return expression
-        moved = _moved(inner, expression, shape)
-        return moved
-    if isinstance(expression, tuple):
-        parts = [_replaced(part, inner, shape) for part in expression[1:]]
-        return None if any(part is None for part in parts) else (expression[0], *parts)
-    return expression
+def _replaced(inner: Loop, shape: tuple[int, ...], at: Leaf) -> Expression | None:
+    """What a leaf of a loop over `shape` reads, another loop's expression where that is its array; None where indices
+    do not follow on."""
+    if at.buffer != inner.buffer:
+        return at
+    if len(inner.shape) > 1:
+        whole = at.offset == 0 and inner.shape == shape and at.strides == _contiguous(inner.shape)
+        return inner.expression if whole else None
 
+    def put(leaf: Leaf) -> Leaf:
+        step = leaf.strides[0] if leaf.strides else 0
+        return Leaf(leaf.buffer, leaf.offset + step * at.offset, tuple(step * s for s in at.strides))
 
-def _moved(inner: Loop, at: Leaf, shape: tuple[int, ...]) -> Expression | None:
-    """The inner expression at the elements that a leaf of a loop over `shape` reads."""
-    along = _contiguous(inner.shape)
-    if len(inner.shape) > 1 and not (at.offset == 0 and inner.shape == shape and at.strides == along):
-        return None
-
-    def put(part: Expression) -> Expression:
-        if isinstance(part, Leaf):
-            if len(inner.shape) > 1:
-                return part
-            step = part.strides[0] if part.strides else 0
-            return Leaf(part.buffer, part.offset + step * at.offset, tuple(step * s for s in at.strides))
-        return (part[0], *map(put, part[1:])) if isinstance(part, tuple) else part
-
-    return put(inner.expression)
+    return _rewritten(inner.expression, put)
 
 
 def _contiguous(shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -193,7 +193,6 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
         own.iterations,
         "Broyden's method" if own.secant else way,
         own.most.numpy(),
-        own.fallback_sd.numpy(),
         dtype,
         {name: _program(functions, name, examples, read) for name in names},
         {routine.name: routine for routine in routines},

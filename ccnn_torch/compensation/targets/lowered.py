@@ -49,10 +49,7 @@ class Found:
     @cached_property
     def nominal(self) -> Mechanism:
         """The machine as it was taken to be, in the frames that were identified."""
-        if self.model.machine is not None:
-            machine = self.model.machine.nominal
-        else:
-            machine = self.model.mechanism(self.allow_code)
+        machine = self.model.mechanism(self.allow_code)
         values = machine.nominal.clone()
         if isinstance(machine, SerialArm):
             values[:6], values[-6:] = self._values[:6], self._values[-6:]
@@ -64,12 +61,7 @@ class Found:
 
     @property
     def _values(self) -> Tensor:
-        if self.model.machine is not None:
-            return self.model.machine.values
-        compensator = self.model.compensator
-        if compensator is not None and compensator.machine is not None:
-            return compensator.machine.identified
-        return self.model.mechanism(self.allow_code).nominal
+        return self.model.identified(self.allow_code).nominal
 
     @cached_property
     def rows(self) -> Situation:

@@ -20,11 +20,15 @@ from ccnn_torch.errors import MethodFailedError
 
 # Operation of torch -> ours, on each element of operands that broadcast.
 _ELEMENTWISE = {
-    "add": "add", "sub": "sub", "mul": "mul", "div": "div", "neg": "neg", "abs": "abs", "exp": "exp", "log": "log",
-    "sin": "sin", "cos": "cos", "tan": "tan", "tanh": "tanh", "asin": "asin", "acos": "acos", "atan": "atan",
-    "atan2": "atan2", "sqrt": "sqrt", "floor": "floor", "minimum": "min", "maximum": "max", "lt": "lt", "le": "le",
-    "eq": "eq", "where": "select", "logical_and": "and", "bitwise_and": "and", "logical_or": "or",
-    "bitwise_or": "or", "logical_not": "not", "bitwise_not": "not",
+    name: name
+    for name in (
+        "add", "sub", "mul", "div", "neg", "abs", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan",
+        "atan2", "sqrt", "floor", "lt", "le", "eq",
+    )
+}  # fmt: skip
+_ELEMENTWISE |= {
+    "minimum": "min", "maximum": "max", "where": "select", "logical_and": "and", "bitwise_and": "and",
+    "logical_or": "or", "bitwise_or": "or", "logical_not": "not", "bitwise_not": "not",
 }  # fmt: skip
 _REDUCTIONS = {"sum": "add", "amax": "max", "amin": "min", "any": "or", "all": "and"}
 _SAME = frozenset({"lift_fresh_copy", "lift_fresh", "detach", "alias", "clone", "copy"})

@@ -88,6 +88,10 @@ class Graph:
                 (self._integers if array.dtype.kind == "i" else self._truths).add(self._constants[key].name)
         return str(self._constants[key].name)
 
+    def whole(self, values: int | Sequence[int]) -> str:
+        """Name of an initializer of 64-bit integers."""
+        return self.constant(np.array(values, np.int64))
+
     def node(
         self, op: str, inputs: Sequence[str], shape: Sequence[int], real: Sequence[int], **attributes: Any
     ) -> Value:
@@ -274,7 +278,7 @@ class Graph:
     def _sizes(self, shape: Sequence[int]) -> str:
         """A shape with the batch of the call in it."""
         if all(n % self.rows or n == 0 for n in shape):
-            return self.constant(np.array(shape, np.int64))
+            return self.whole(shape)
         first = self._inputs[0].name
         batch = self.node("Shape", [first], (1,), (1,), start=0, end=1).name
         parts = []
@@ -282,8 +286,8 @@ class Graph:
             times = n // self.rows if n and n % self.rows == 0 else 0
             part = batch
             if times > 1:
-                part = self.node("Mul", [batch, self.constant(np.array([times], np.int64))], (1,), (1,)).name
-            parts.append(part if times else self.constant(np.array([n], np.int64)))
+                part = self.node("Mul", [batch, self.whole([times])], (1,), (1,)).name
+            parts.append(part if times else self.whole([n]))
         return parts[0] if len(parts) == 1 else self.node("Concat", parts, (len(shape),), (len(shape),), axis=0).name
 
 

@@ -17,11 +17,13 @@ from ccnn_torch.compensation.targets.onnx_graph import Graph, Value, batch_of
 from ccnn_torch.errors import MethodFailedError
 
 _NAMES = {
-    "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "neg": "Neg", "abs": "Abs", "exp": "Exp", "log": "Log",
-    "sin": "Sin", "cos": "Cos", "tan": "Tan", "tanh": "Tanh", "asin": "Asin", "acos": "Acos", "atan": "Atan",
-    "sqrt": "Sqrt", "floor": "Floor", "pow": "Pow", "min": "Min", "max": "Max", "lt": "Less", "le": "LessOrEqual",
-    "eq": "Equal", "and": "And", "or": "Or", "not": "Not", "select": "Where", "sigmoid": "Sigmoid",
+    name: name.capitalize()
+    for name in (
+        "add", "sub", "mul", "div", "neg", "abs", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan",
+        "sqrt", "floor", "pow", "min", "max", "and", "or", "not", "sigmoid",
+    )
 }  # fmt: skip
+_NAMES |= {"lt": "Less", "le": "LessOrEqual", "eq": "Equal", "select": "Where"}
 _REDUCTIONS = {"add": "ReduceSum", "max": "ReduceMax", "min": "ReduceMin", "or": "ReduceMax", "and": "ReduceMin"}
 
 
@@ -64,7 +66,7 @@ class ByTensors(Lowering):
         solid, axes = graph.full(value), sorted(dims)
         shape = [1 if k in axes else n for k, n in enumerate(solid.shape) if keep or k not in axes]
         if op == "add" or graph.opset >= 18:
-            names = [solid.name, graph.constant(np.array(axes, np.int64))]
+            names = [solid.name, graph.whole(axes)]
             return graph.node(_REDUCTIONS[op], names, shape, shape, keepdims=int(keep))
         return graph.node(_REDUCTIONS[op], [solid.name], shape, shape, keepdims=int(keep), axes=axes)
 
@@ -95,11 +97,9 @@ class ByTensors(Lowering):
         step = int(places[1] - places[0]) if len(places) > 1 else 1
         if len(places) and step > 0 and torch.equal(places, int(places[0]) + step * torch.arange(len(places))):
             limits = (int(places[0]), int(places[-1]) + 1, dim, step)
-            names = [graph.constant(np.array([v], np.int64)) for v in limits]
+            names = [graph.whole([v]) for v in limits]
             return graph.node("Slice", [solid.name, *names], shape, shape)
-        return graph.node(
-            "Gather", [solid.name, graph.constant(places.numpy().astype(np.int64))], shape, shape, axis=dim
-        )
+        return graph.node("Gather", [solid.name, graph.whole(places.tolist())], shape, shape, axis=dim)
 
     def moved(self, node: Node, args: Any, kwargs: Any) -> Any:
         move = _MOVES.get(operation_of(node))
@@ -177,14 +177,14 @@ class ByTensors(Lowering):
             shape[shape.index(-1)] = math.prod(solid.shape) // -math.prod(shape)
         if shape == [*solid.shape]:
             return solid
-        sizes = self.graph.constant(np.array(batch_of(shape, self.graph.rows), np.int64))
+        sizes = self.graph.whole(batch_of(shape, self.graph.rows))
         return self.graph.node("Reshape", [solid.name, sizes], shape, shape)
 
     def _unsqueezed(self, value: Value, dim: int) -> Value:
         solid = self.graph.solid(value)
         at = dim % (len(solid.shape) + 1)
         shape, real = ([*sizes[:at], 1, *sizes[at:]] for sizes in (solid.shape, solid.real))
-        names = [solid.name, self.graph.constant(np.array([at], np.int64))]
+        names = [solid.name, self.graph.whole([at])]
         return self.graph.node("Unsqueeze", names, shape, real)
 
     def _squeezed(self, value: Value, dim: int) -> Value:
@@ -193,7 +193,7 @@ class ByTensors(Lowering):
         solid = self.graph.solid(value)
         at = dim % len(solid.shape)
         shape, real = ([*sizes[:at], *sizes[at + 1 :]] for sizes in (solid.shape, solid.real))
-        return self.graph.node("Squeeze", [solid.name, self.graph.constant(np.array([at], np.int64))], shape, real)
+        return self.graph.node("Squeeze", [solid.name, self.graph.whole([at])], shape, real)
 
     def _permuted(self, value: Value, order: Sequence[int]) -> Value:
         solid = self.graph.solid(value)
@@ -210,7 +210,7 @@ class ByTensors(Lowering):
         solid = self.graph.full(value)
         dim %= len(solid.shape)
         shape = [n for k, n in enumerate(solid.shape) if k != dim]
-        at = self.graph.constant(np.array(index % solid.shape[dim], np.int64))
+        at = self.graph.whole(index % solid.shape[dim])
         return self.graph.node("Gather", [solid.name, at], shape, shape, axis=dim)
 
     def _sliced(self, value: Value, dim: int = 0, start: Any = None, end: Any = None, step: int = 1) -> Any:

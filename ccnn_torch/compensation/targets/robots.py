@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
@@ -110,7 +110,8 @@ def print_ur(found: Found) -> Stack:
     nominal, identified = arm_in(found)
     kind, frames = _ur_frames(chain(nominal))
     real = chain(identified)
-    fixed = frames[0] @ np.linalg.inv(of_rpy((0, 0, _height(frames)), (0, 0, 0)))
+    # d1 is how far the first two axes' crossing is above the arm's own base.
+    fixed = frames[0] @ np.linalg.inv(of_rpy((0, 0, frames[0][2, 3]), (0, 0, 0)))
     made = real.through(fixed, [nearest_on(*pair) for pair in zip(real.frames, frames, strict=True)])
     lines = ["kinematics:"]
     for name, m in zip(_UR_LINKS, made.origins, strict=True):
@@ -135,11 +136,6 @@ def print_ur(found: Found) -> Stack:
     return Stack({"kinematics.yaml": "\n".join(lines) + "\n"}, arm_of(made, identified), load)
 
 
-def _height(frames: Sequence[Array]) -> float:
-    """d1: of the first two axes' crossing above the arm's own base [m]."""
-    return float(frames[0][2, 3])
-
-
 def _ur_frames(made: Chain) -> tuple[str, list[Array]]:
     """The type of a UR, and the frames of its joints as ur_description has them, in the arm's own base.
 
@@ -151,7 +147,7 @@ def _ur_frames(made: Chain) -> tuple[str, list[Array]]:
         # x is across the first two axes, which meet.
         x = np.cross(first[:3, 2], second[:3, 2])
         size = float(np.linalg.norm(x))
-        up = second[:3, 3] - second[:3, 2] * float(_along(gap, first, second))
+        up = second[:3, 3] - second[:3, 2] * float(_along(gap))
         for kind, sizes in _UR.items() if size > 0.5 else ():
             turned = np.stack([x / size, np.cross(first[:3, 2], x / size), first[:3, 2]], -1)
             frames = [matrix(turned, up)]
@@ -164,7 +160,7 @@ def _ur_frames(made: Chain) -> tuple[str, list[Array]]:
     )
 
 
-def _along(gap: Array, first: Array, second: Array) -> float:
+def _along(gap: Array) -> float:
     """How far from the origin of the second frame, against its z, that axis is nearest to the first one [m]."""
     flat = gap[:2, 2]
     return float(flat @ gap[:2, 3] / (flat @ flat))

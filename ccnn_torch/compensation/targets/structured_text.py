@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -39,10 +38,6 @@ def print_structured_text(form: Form, golden: Golden) -> dict[str, str]:
     text = "\n\n".join([comment, *blocks, *(_routine(routine, form) for routine in form.routines.values())]) + "\n"
     readme = filled("structured_text.md.jinja", real=_real(form))
     return {"compensator.st": text, "selftest.st": _selftest(form, golden), "README.md": readme}
-
-
-def _sizes(form: Form) -> dict[str, Any]:
-    return {"n": len(form.joints), "m": len(form.covariates), "real": _real(form)}
 
 
 def _real(form: Form) -> str:
@@ -196,5 +191,7 @@ def _selftest(form: Form, golden: Golden) -> str:
         status=golden.outputs["status"][rows].tolist(),
         count=_TESTED,
         rounding=_literal(4 * float(np.finfo(form.dtype).eps), form.dtype),
-        **_sizes(form),
+        n=len(form.joints),
+        m=len(form.covariates),
+        real=_real(form),
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from torch import Tensor
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.display import identifiers, plain
 from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.files.write import csv_text
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
@@ -47,26 +46,28 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None, mesh: bo
     if count < 3:
         raise MethodFailedError(f"a table over {n} joints would be too coarse; export the model as c99 or st")
     low, high = (v[:n].numpy() for v in (compensator.domain.low, compensator.domain.high))
-    lines = [np.linspace(a, b, count) for a, b in zip(low, high, strict=True)]
-    grid = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
     middle = compensator.domain.centre[n:]
-    values = _deviation(compensator, grid.reshape(-1, n), middle).reshape(grid.shape)
     drawn = low + (high - low) * np.random.default_rng(0).random((_CHECKED, n))
     checked = _inside(compensator, drawn, middle)
     truth = _deviation(compensator, checked, middle)
-    tables = {"table.csv": _csv(compensator, grid.reshape(-1, n), values.reshape(-1, n))}
-    told = [_said("table.csv", "all joints, linear between the points", truth, _between(lines, values, checked))]
+
+    def gridded(name: str, what: str, count: int) -> tuple[Array, Array]:
+        """Points of a grid and their deviations, `s x n` each; how far off it is goes to `told`."""
+        lines = [np.linspace(a, b, count) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
+        points = grid.reshape(-1, n)
+        values = _deviation(compensator, points, middle)
+        between = _between(lines, values.reshape(grid.shape), checked)
+        told.append(_said(name, f"{what}, linear between the points", truth, between))
+        return points, values
+
+    told: list[str] = []
+    tables = {"table.csv": _csv(compensator, *gridded("table.csv", "all joints", count))}
     axes, rows, said = _axis_tables(compensator, low, high, drawn)
     tables |= axes
     told.append(rows)
     if mechanism is not None and _is_cartesian(mechanism):
-        lines = [np.linspace(a, b, _RECORDS) for a, b in zip(low, high, strict=True)]
-        grid = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
-        values = _deviation(compensator, grid.reshape(-1, n), middle).reshape(grid.shape)
-        tables["beckhoff_grid.csv"] = _isg(grid.reshape(-1, n), values.reshape(-1, n))
-        told.append(
-            _said("beckhoff_grid.csv", "X, Y, Z, linear between the points", truth, _between(lines, values, checked))
-        )
+        tables["beckhoff_grid.csv"] = _isg(*gridded("beckhoff_grid.csv", "X, Y, Z", _RECORDS))
     if mesh and mechanism is not None and [c.name for c in mechanism.pose] == ["x", "y", "z"]:
         tables["klipper_mesh.cfg"], sentence = _mesh(compensator, mechanism)
         told.append(sentence)
@@ -204,12 +205,9 @@ def _said(name: str, what: str, truth: Array, found: Array) -> str:
 
 
 def _csv(compensator: Compensator, grid: Array, values: Array) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     headers = [plain(c.header) for c in compensator.joints]
-    writer.writerow(headers + [f"deviation_{header}" for header in headers])
-    writer.writerows([repr(float(v)) for v in row] for row in np.hstack([grid, values]))
-    return text.getvalue()
+    names = headers + [f"deviation_{header}" for header in headers]
+    return csv_text([names, *(map(repr, row) for row in np.hstack([grid, values]).tolist())])
 
 
 def _screw(line: Array, up: Array, down: Array) -> str:

@@ -9,7 +9,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.motion.effects import bodies, control, friction, gears
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 from ccnn_torch.plugins import is_plugin, load_plugin
-from ccnn_torch.spelling import nearest
+from ccnn_torch.spelling import nearest_hint
 
 EFFECTS: dict[str, MotionEffect] = {
     effect.name: effect
@@ -53,8 +53,7 @@ def motion_effects(names: Sequence[str] | None = None) -> list[MotionEffect]:
         elif name in EFFECTS:
             found[name] = EFFECTS[name]
         else:
-            near = nearest(name, list(EFFECTS))
-            hint = f"; '{near}' is the nearest" if near else ""
+            hint = nearest_hint(name, [*EFFECTS])
             raise InputError(f"effects: there is no effect of motion '{name}'{hint}; known: {', '.join(EFFECTS)}")
     # In the same order always, so that the order in which they are asked for decides no tie.
     return sorted(found.values(), key=lambda effect: [*EFFECTS, effect.name].index(effect.name))
