@@ -63,12 +63,13 @@ class Backlash(OfJoints):
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """The machine's weight beside a load that was recorded, the push that friction holds, and the edge's width."""
-        edges = (Shape("hold", "1", _HOLDS, usual=_HOLDS[-1]), Shape("width", "1", _WIDTHS, usual=_WIDTHS[0]))
-        if not situation.directed:
+        found = [Shape("weight", "N", (0.0, *WEIGHTS), usual=PLATFORM_WEIGHT)] if situation.loaded else []
+        if situation.directed:
+            found += [Shape("hold", "1", _HOLDS, usual=_HOLDS[-1]), Shape("width", "1", _WIDTHS, usual=_WIDTHS[0])]
+        else:
             # Of another name: numbers that were found with directions are none without.
-            edges = (Shape("edge", "1", _LOOSE, usual=_LOOSE[0]),)
-        balanced = (0.0, *WEIGHTS)
-        return (Shape("weight", "N", balanced, usual=PLATFORM_WEIGHT), *edges) if situation.loaded else edges
+            found.append(Shape("edge", "1", _LOOSE, usual=_LOOSE[0]))
+        return tuple(found)
 
     def moving(self, situation: Situation) -> list[int]:
         """Joints whose direction is known; all, where that is of none."""
