@@ -39,7 +39,7 @@ def test_records_hold_what_was_injected_and_nothing_else(cli: Cli, tmp_path: Pat
     assert names == ["time", "temperature", "load_x", "load_y", "direction1", "direction2"]
     covariates = dict(zip(names, records.covariates.unbind(-1), strict=True))
     situation = Situation(mechanism, records.joints, covariates, default_gravity(mechanism))
-    columns = signature(situation, make_effect("backlash"), torch.tensor([100.0, 60.0, 0.05], dtype=torch.float64))
+    columns = signature(situation, make_effect("backlash"), torch.tensor([100.0, 60.0, 0.3], dtype=torch.float64))
     play = [0, 3]  # of either joint; the rest is what a load does to it
     residual = pose_residual(situation, records.pose).flatten()
     fitted = torch.linalg.lstsq(columns[..., play].flatten(0, 1), residual).solution
@@ -129,6 +129,7 @@ def test_an_own_effect_takes_part(cli: Cli, tmp_path: Path) -> None:
         ("backlsh", "did you mean 'backlash'?"),
         ("outliers", "did you mean 'outlier'?"),
         ("backlash:q3=1e-4", "it has no parameter 'q3'; it has q1, q1_softer, q1_harder"),
+        ("backlash:q1_softr=1", "did you mean 'q1_softer'?"),
         ("backlash:widht=1", "did you mean 'width'?"),
         ("backlash:q1", "write NAME or NAME:parameter=value"),
         ("backlash:q1=much", "q1=much is no number"),

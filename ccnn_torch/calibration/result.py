@@ -270,7 +270,9 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, outcome: Out
         weights=weights, rotation_weight=config.rotation_weight, **{name: error for name, (error, _) in found.items()}
     )
     models = torch.stack([error.position for name, (error, _) in found.items() if name != "not_compensable"])
-    far = (weights > 0) & ~inlying(models.nan_to_num(torch.inf).amin(0), weights > 0, 3, 0)
+    # Of some rows no position is known.
+    least, known = models.amin(0), (weights > 0) & models.isfinite().all(0)
+    far = known & ~inlying(least, known, 3, 0)
     if not bool(far.any()):
         return pose
     others = pose_block(found["before"][0], found["after"][0], weights * ~far).position

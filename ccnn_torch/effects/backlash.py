@@ -15,25 +15,25 @@ from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.mechanisms.frames.set_ups import GIVE
 
 _SCALE = {"m": 1.5e-4, "rad": 2e-4}
-# Pushes at which a joint leaves its flank, in units of the usual one, and over how much push it does: beyond the widest
-# a change is in proportion to the load.
-_HOLDS = (0.0, 0.2, 0.5, 1.2, 3.0, 60.0)
-_WIDTHS = (0.05, 0.2, 0.8)
-# Where no direction is known.
-_LOOSE = (0.03, 0.06)
+# Pushes at which a joint leaves its flank, in units of the usual one; and over what range of push it does, as a share.
+_HOLDS = (0.0, 0.1, 0.2, 0.4, 0.7, 1.2, 2.0, 3.5, 6.0, 60.0)
+# Where no direction is known: beyond them a change is in proportion to the load.
+_LOOSE = _HOLDS[1:3]
+_WIDTHS = (0.3, 1.0, 4.0)
 _EDGES = ((" softer", 2.0), (" harder", 0.5))
 
 
 class Backlash(OfJoints):
-    """Δq_i = b_i / 2 tanh((w_i - h s_i) / e): s the direction of approach, w the push on the joint.
+    """Δq_i = b_i / 2 tanh((w_i / h - s_i) / e) / tanh(1 / e): s the direction of approach, w the push on the joint.
 
-    Without any direction s is 0, and e so small that a load throws the joint from one flank to the other, as it does
+    Without any direction s is 0, and h so small that a load throws the joint from one flank to the other, as it does
     one whose bolt or bearing is loose.
 
     A joint rests on the flank that drove it, half the backlash b behind the motor's middle, unless weight and load push
     it onto the other flank whichever way it came; friction holds it there up to the push h, and gears give over a range
-    e of it (lost motion). The machine's weight, h and e are shapes, for all joints alike; without a push that reaches h
-    this is -b s / 2. Secondary: the same with an edge twice and half as wide, less the part with e.
+    e h of it (lost motion). The machine's weight, h and e are shapes, h and e for all joints alike; without a push that
+    reaches h this is -b s / 2. Secondary: the same with an edge twice and half as wide, less the part with e, so that b
+    stays the backlash.
     """
 
     name = "backlash"
@@ -78,13 +78,16 @@ class Backlash(OfJoints):
     def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
         """Where each joint rests, and what other edges change of that."""
         weight = shape[..., 0] if situation.loaded else shape.new_tensor(PLATFORM_WEIGHT)
-        push, width = situation.push(weight, rows), shape[..., -1, None, None]
-        hold = shape[..., -2, None, None] if situation.directed else torch.zeros_like(width)
-        push = push - hold * of_rows(situation.direction, rows)
-        rest = torch.tanh(push / width)
+        hold, width = shape[..., -1, None, None], torch.full_like(shape[..., -1, None, None], _WIDTHS[0])
+        if situation.directed:
+            hold, width = shape[..., -2, None, None], hold
+        # A joint that friction does not hold at all changes its flank as softly as one that it hardly holds.
+        unit = hold.clamp_min(_HOLDS[1])
+        left = (situation.push(weight, rows) - hold * of_rows(situation.direction, rows)) / unit
+        rest = _rest(left, width)
         # What friction holds against any push comes to no edge.
-        edges = [(torch.tanh(push / (width * times)) - rest) * (hold < _HOLDS[-1]) for _, times in _EDGES]
-        return torch.stack([rest, *edges], -1) / 2
+        edges = [(_rest(left, times * width) - rest) * (hold < _HOLDS[-1]) for _, times in _EDGES]
+        return torch.stack([rest, *edges], -1)
 
 
 def _without_direction(mechanism: Mechanism, covariates: Sequence[str]) -> str:
@@ -92,6 +95,11 @@ def _without_direction(mechanism: Mechanism, covariates: Sequence[str]) -> str:
     n = len(mechanism.joints)
     there = any(f"direction{i + 1}" in covariates for i in range(n))
     return "" if there else f"the sign of each joint's last motion before it stopped: direction1[1]…direction{n}[1]"
+
+
+def _rest(left: Tensor, width: Tensor) -> Tensor:
+    """Where a joint rests within its backlash, ±1/2 where nothing pushes it off its flank."""
+    return torch.tanh(left / width) / (2 * torch.tanh(1 / width))
 
 
 # A joint's friction is some tenths of what it carries, its constant part like that of a tenth of the platform's weight.

@@ -63,7 +63,7 @@ def left(built: RealisticMachine, repeat: int, effects: list[str], secondary: bo
     elif len(effects) == 1:
         # The textbook has one value of most shapes, and no search.
         every = make_effect(effects[0]).shapes(rows)
-        grids = [s.grid[:: 1 + (len(s.grid) > 6)] if secondary or s.usual is None else (s.usual,) for s in every]
+        grids = [s.grid[::2] if secondary or s.usual is None else (s.usual,) for s in every]
         shapes = [list(values) for values in product(*grids)]
     shares = []
     for shape in shapes:

@@ -157,7 +157,8 @@ def candidates_about_set(
         for shaped in shapes:
             if not any(_same_shape(a, shaped) for a in own):
                 own.append(without_unused_rows(_atom(situation, there, effect, shaped), usable))
-        own += without_secondary(situation, own)
+        formed = without_secondary(situation, own)
+        own += [a for a in formed if not any(_same_shape(b, Shaped(a.shape, a.used, 0.0)) for b in own)]
         atoms += [*own, *_in_few_joints(situation, own, white, beside(others))]
     return atoms
 

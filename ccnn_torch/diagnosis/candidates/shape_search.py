@@ -34,7 +34,7 @@ _AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
 # where peaks go on that are lower by no more than such a share.
 _PEAKS, _AS_HIGH = 4, 0.02
 # Shapes that share coefficients are searched together where that are no more values.
-_TOGETHER = 200
+_TOGETHER = 300
 # Log evidence for each coefficient whose shape is worth its search.
 _PAYS = 1.5
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.candidates.atom import default_shape, scaled_signature
+from ccnn_torch.diagnosis.candidates.atom import default_shape, scaled_signature, textbook_shapes
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
@@ -114,7 +114,8 @@ class OfOrder(NamedTuple):
         effects: what they would show.
         columns: of rows and an order of theirs, by name, `s` each.
         clearly: log odds that they must gain, and times what random orders gain.
-        every: of each grid of its shapes every so many values are tried, from the first on; () = the middle ones.
+        every: of each grid of its shapes every so many values are tried, from the first on; () = the middle
+            ones, and those of the textbook.
     """
 
     effects: tuple[Effect, ...]
@@ -126,7 +127,7 @@ class OfOrder(NamedTuple):
         """Of the effects at each of the shapes tried, `s x c x m` each; there: rows with the columns."""
         found = []
         for effect in self.effects:
-            shapes = [default_shape(there, effect)]
+            shapes = [default_shape(there, effect), textbook_shapes(there, effect)[0]]
             if self.every:
                 grids = [s.grid[::n] for s, n in zip(effect.shapes(there), self.every, strict=False)]
                 shapes = [torch.tensor(values, dtype=torch.float64) for values in product(*grids)]
