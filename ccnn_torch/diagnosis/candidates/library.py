@@ -153,14 +153,21 @@ def candidates_about_set(
             shapes = [scan.best(ground(them), start) for them in beside_what]
             found = [a for a in known.starts if a.effect is effect]
         shapes += [Shaped(a.shape, a.used, EFFECT - a.log_prior) for a in found]
-        own: list[Atom] = []
-        for shaped in shapes:
-            if not any(_same_shape(a, shaped) for a in own):
-                own.append(without_unused_rows(_atom(situation, there, effect, shaped), usable))
-        formed = without_secondary(situation, own)
-        own += [a for a in formed if not any(_same_shape(b, Shaped(a.shape, a.used, 0.0)) for b in own)]
+        own = _at_shapes(situation, there, effect, shapes, usable)
         atoms += [*own, *_in_few_joints(situation, own, white, beside(others))]
     return atoms
+
+
+def _at_shapes(
+    situation: Situation, there: Situation, effect: Effect, shapes: Sequence[Shaped], usable: Tensor
+) -> list[Atom]:
+    """An effect at different shapes, whole and without what only mends its form."""
+    found: list[Atom] = []
+    for shaped in shapes:
+        if not any(_same_shape(a, shaped) for a in found):
+            found.append(without_unused_rows(_atom(situation, there, effect, shaped), usable))
+    formed = without_secondary(situation, found)
+    return found + [a for a in formed if not any(_same_shape(b, Shaped(a.shape, a.used, 0.0)) for b in found)]
 
 
 def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped) -> Atom:
