@@ -66,7 +66,9 @@ def measured(situation: Situation, causes: dict[str, float], seed: int, noise: f
         coefficients = effect.coefficients(situation)
         scale = torch.tensor([0.0 if c.secondary else c.scale for c in coefficients], dtype=torch.float64)
         drawn = torch.randn(len(scale), generator=g, dtype=torch.float64) * scale * 1e-3
-        shape = torch.tensor([s.grid[len(s.grid) // 3] for s in effect.shapes(situation)], dtype=torch.float64)
+        # Edges of the usual width leave the flanks apart.
+        shapes = [s.usual if s.name == "width" else s.grid[len(s.grid) // 3] for s in effect.shapes(situation)]
+        shape = torch.tensor(shapes, dtype=torch.float64)
         for _ in range(3):
             moved = (reached(situation, [Acting(effect, shape, drawn)]) - still)[:, :3]
             # The usual row, so that one close to a singularity does not have the whole gap.

@@ -73,9 +73,8 @@ def test_a_verdict_without_its_unsure_second_name_is_as_likely_as_its_first(tmp_
     assert best.names > {"instrument"} and best.probability < 0.9 and found.verdict["probability"] == pytest.approx(0.9)
 
 
-def test_backlash_stays_a_candidate_without_what_should_only_mend_its_form(tmp_path):
-    """Its edges take so much beside a load that they cannot be but corrections: that is no reason to call it another
-    name."""
+def test_backlash_whose_edge_is_wide_is_no_friction(tmp_path):
+    """Of one width its corrections took so much beside a load that it was dropped, and friction named."""
     case = make("pair_8", 920)
     write_table(tmp_path / "records.csv", dict(case.columns))
     mechanism, noise = _mechanism(case, tmp_path), case.noise

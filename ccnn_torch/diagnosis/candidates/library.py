@@ -81,7 +81,6 @@ def candidates_about_nominal(
         for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(without_unused_rows(_atom(situation, situation, atom.effect, shaped), usable))
-    starts += without_secondary(situation, starts)
     starts += _in_few_joints(situation, starts, white, residual)
     return [*map(_charged, [*whole, *parts]), *starts]
 
@@ -153,21 +152,12 @@ def candidates_about_set(
             shapes = [scan.best(ground(them), start) for them in beside_what]
             found = [a for a in known.starts if a.effect is effect]
         shapes += [Shaped(a.shape, a.used, EFFECT - a.log_prior) for a in found]
-        own = _at_shapes(situation, there, effect, shapes, usable)
+        own: list[Atom] = []
+        for shaped in shapes:
+            if not any(_same_shape(a, shaped) for a in own):
+                own.append(without_unused_rows(_atom(situation, there, effect, shaped), usable))
         atoms += [*own, *_in_few_joints(situation, own, white, beside(others))]
     return atoms
-
-
-def _at_shapes(
-    situation: Situation, there: Situation, effect: Effect, shapes: Sequence[Shaped], usable: Tensor
-) -> list[Atom]:
-    """An effect at different shapes, whole and without what only mends its form."""
-    found: list[Atom] = []
-    for shaped in shapes:
-        if not any(_same_shape(a, shaped) for a in found):
-            found.append(without_unused_rows(_atom(situation, there, effect, shaped), usable))
-    formed = without_secondary(situation, found)
-    return found + [a for a in formed if not any(_same_shape(b, Shaped(a.shape, a.used, 0.0)) for b in found)]
 
 
 def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped) -> Atom:
@@ -289,16 +279,15 @@ def _in_few_joints(situation: Situation, shaped: Sequence[Atom], white: Whitenin
 def without_secondary(situation: Situation, atoms: Sequence[Atom]) -> list[Atom]:
     """Of the effects that have secondary coefficients the others alone, and all but those that only mend a form.
 
-    Of effects with shapes only the latter: what else is secondary in them is the search's choice. One scale for all
-    would charge for the zeros of joints that count from the middle, and a term of no effect would then be the cheaper
-    name for their gains.
+    One scale for all would charge for the zeros of joints that count from the middle, and a term of no effect would
+    then be the cheaper name for their gains.
     """
     found = []
-    for atom in (a for a in atoms if a.used is None):
+    for atom in atoms:
         coefficients = atom.coefficients(situation)
         main = [k for k, c in enumerate(coefficients) if not c.secondary]
         formed = [k for k, c in enumerate(coefficients) if not c.mends]
-        parts = [formed] if main == formed or atom.shape.numel() else [main, formed]
+        parts = [main] if main == formed else [main, formed]
         found += [_with(atom, part, _EITHER) for part in parts if 0 < len(part) < len(coefficients)]
     return found
 

@@ -71,10 +71,12 @@ def judge_rows(analysis: Analysis) -> Judgement:
     levels = with_form_error(dictionary, sets[0], analysis.floor, analysis.noise_is_known)
     usual, every = levels[0], _explanations(analysis, levels)
     leading = every
-    # Candidates that are supported by aliased coefficients alone are none: the others are searched without them.
-    while borrowed := borrowed_candidates(analysis, usual, leading[0].best):
-        dictionary = replace(dictionary, groups={i: g for i, g in dictionary.groups.items() if i not in borrowed})
-        sets = [f for f in sets if not borrowed & {*f.members}]
+    # Effects that are supported by aliased coefficients alone are no candidates: sets of the others are searched anew,
+    # since larger ones were looked for beside them only.
+    while borrowed := borrowed_names(analysis, usual, leading[0].best):
+        left = {i: g for i, g in dictionary.groups.items() if analysis.atoms[i].name not in borrowed}
+        dictionary = replace(dictionary, groups=left)
+        sets = [f for f in sets if not borrowed & _named(analysis, f)[0]]
         levels = with_form_error(dictionary, sets[0], analysis.floor, analysis.noise_is_known)
         usual, leading = levels[0], _explanations(analysis, levels)
     refitted = _fits(analysis.dictionary, [e.best.members for e in leading], {f.members: f for f in analysis.found})
@@ -272,10 +274,10 @@ def _second_driver(analysis: Analysis, posterior: Posterior, found: FittedSet) -
     return (atoms[best].name,) if odds > 0 else ()
 
 
-def borrowed_candidates(analysis: Analysis, posterior: Posterior, found: FittedSet) -> frozenset[int]:
-    """Members of a set that rest on what other effects do as well, or on what should only correct their form; and all
-    of a name that would be of a size beside others that no cause has."""
-    dictionary, borrowing, most = posterior.dictionary, set[int](), implausible_size(analysis)
+def borrowed_names(analysis: Analysis, posterior: Posterior, found: FittedSet) -> frozenset[str]:
+    """Names of a set that rest on what other effects do as well, or on what should only correct their form, or that
+    would be of a size beside others that no cause has."""
+    dictionary, names, most = posterior.dictionary, set(), implausible_size(analysis)
     for i, mean in zip(found.members, found.mean, strict=True):
         atom, group = analysis.atoms[i], dictionary.groups[i]
         if atom.is_discrepancy:
@@ -283,7 +285,7 @@ def borrowed_candidates(analysis: Analysis, posterior: Posterior, found: FittedS
         coefficients = atom.coefficients(analysis.situation)
         main_sizes = [abs(float(v)) for c, v in zip(coefficients, mean, strict=True) if not c.secondary]
         if len(found.members) > 1 and max(main_sizes, default=0.0) > most:
-            borrowing |= {k for k in dictionary.groups if analysis.atoms[k].name == atom.name}
+            names.add(atom.name)
             continue
         if not any(c.borrowed or c.mends for c in coefficients):
             continue
@@ -296,8 +298,8 @@ def borrowed_candidates(analysis: Analysis, posterior: Posterior, found: FittedS
         alone, main, whole = (float(m @ gram @ m) for m in parts)
         largest, mended = (float((mean * kind).abs().max()) for kind in (~corrections, corrections))
         if alone < _OWN * whole or (main < _MAIN * whole and mended > _MENDED * largest):
-            borrowing.add(i)
-    return frozenset(borrowing)
+            names.add(atom.name)
+    return frozenset(names)
 
 
 def implausible_size(analysis: Analysis) -> float:
