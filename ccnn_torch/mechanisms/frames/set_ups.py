@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import product
 
@@ -23,7 +24,7 @@ GIVE = {"m": 1e-7, "rad": 2e-6}
 """Plausible compliance of a drive: 1e-7 m/N (10 N/µm), 2e-6 rad/(N·m)."""
 
 
-class _Columned(Mechanism):
+class _Columned(Mechanism, ABC):
     """A machine with further columns behind its joints, and other parameters; its poses are the machine's."""
 
     def __init__(self, machine: Mechanism, more: Sequence[Coordinate], geometry: Sequence[Parameter]) -> None:
@@ -39,9 +40,9 @@ class _Columned(Mechanism):
         )
         self.machine, self.orientations = machine, machine.orientations
 
+    @abstractmethod
     def inside(self, joints: Tensor, parameters: Tensor | None) -> tuple[Tensor, Tensor]:
         """Joints of the machine, and its parameters there."""
-        raise NotImplementedError
 
     def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """As of an arm."""
