@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,6 +27,8 @@ _MOST_ARROWS = 160
 _LENGTH = 0.12
 # How far above a panel the scale of its errors is [inches].
 _ABOVE = 0.15
+# Characters of a title that fit above a panel.
+_TITLE = 26
 # Of the width below which a machine has no second direction.
 _FLAT = 1e-3
 
@@ -77,7 +80,8 @@ def machine_plot(arrays: Mapping[str, Array], after_words: str) -> Plot | None:
     for axes, values, size, title, colour in zip(panels, (before, after), sizes, titles, (BEFORE, AFTER), strict=True):
         axes.scatter(1e3 * place[chosen][:, plane[0]], 1e3 * place[chosen][:, plane[1]], s=5, color=GREY, linewidths=0)
         _draw_errors(axes, place[chosen][:, plane], values[chosen], plane, times, long, above, colour)
-        axes.set_title(f"{title}\nRMS {number_text(size / scale, 3)} {unit}", pad=19)
+        # No wider than its panel.
+        axes.set_title(f"{fill(title, _TITLE)}\nRMS {number_text(size / scale, 3)} {unit}", pad=19)
         _frame(axes, plane, place, _LENGTH * width)
     shown = "" if len(chosen) == len(place) else f", {len(chosen)} of {len(place)} rows"
     beside = "The machine in the middle of the measured poses (dots); where " if lines else "Where "

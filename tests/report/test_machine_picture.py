@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 from diagnosis_cases import one_effect, with_rotation
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.quiver import Quiver
@@ -51,6 +52,14 @@ def test_the_plane_is_that_of_the_largest_extent() -> None:
     assert plot is not None and len(plot.figure.axes) == 2
     assert plot.figure.axes[0].get_ylabel() == "z [mm]"
     assert "What is left" in plot.figure.axes[1].get_title(loc="left")
+
+
+def test_a_long_title_stays_within_the_picture() -> None:
+    plot = machine_plot(_arrays(), "With geometry + effects + constant")
+    assert plot is not None
+    FigureCanvasAgg(plot.figure).draw()
+    title = plot.figure.axes[-1]._left_title.get_window_extent()  # type: ignore[attr-defined]
+    assert title.x1 < plot.figure.bbox.x1
 
 
 def test_errors_without_a_direction_are_circles_as_wide_as_they_are_large() -> None:
