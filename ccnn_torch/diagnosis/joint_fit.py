@@ -240,7 +240,7 @@ class _Model:
     def labels(self) -> list[tuple[str, str]]:
         """What the coefficients of a group have in common: what they are of, and which part."""
         found = [
-            (k.effect.name, "secondary" if c.secondary else "")
+            (k.effect.name, c.by or ("secondary" if c.secondary else ""))
             for k in self.known
             for c in k.effect.coefficients(self.situation)
         ]
@@ -385,9 +385,10 @@ def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
             break
         sets = [[g for label, g in groups.items() if label not in gone] for gone in ([], *removed)]
         evidence = fit_sets(grams, sets, 0.0).log_evidence
-        gain = evidence[1:] - evidence[0]
+        # An effect costs its place in the library; what is secondary in one that is there is as likely there as not.
+        gain = evidence[1:] - evidence[0] - torch.tensor([0.0 if part else EFFECT for _, part in names])
         best = int(gain.argmax())
-        if float(gain[best]) < EFFECT:
+        if float(gain[best]) < 0:
             break
         groups = {label: g for label, g in groups.items() if label not in removed[best]}
     kept = torch.zeros(rows.model.size, dtype=torch.bool)

@@ -124,12 +124,15 @@ _HARMONICS = tuple(
     for k, size in ((1, 1.0), (2, 0.5), (3, 0.02), (4, 0.02))
     for wave in ("sin", "cos")
 )
-# Harmonics of a turn; those of a harmonic drive's ball cage and teeth lie near the hundredth.
-_MOST_PER_TURN = 130
-# Periods over the travel of a sliding joint; fewer than the first are indistinguishable from a bend.
-_PERIODS = (1.5, 40.0)
+# Harmonics of a turn, up to the wave generator of a harmonic drive of 160 : 1, the highest that is common.
+_MOST_PER_TURN = 161
+# Periods of a sliding joint over the travel of the rows: fewer than the first are indistinguishable from a bend; screws
+# of the shortest lead [m] (ISO 3408-2 begins at 1 mm, machines at 2) are looked for, but no more periods than the last.
+_FEWEST_PERIODS, _SHORTEST_LEAD, _MOST_PERIODS = 1.5, 2e-3, 250.0
 # Of a period over the travel between neighbours of the grid; a wave is lost from a whole one on.
 _PERIOD_STEP = 1 / 3
+# Travel of the rows, at least, as a share of the workspace's.
+_LEAST_TRAVEL = 0.1
 
 
 class Transmission(OfJoints):
@@ -154,8 +157,10 @@ class Transmission(OfJoints):
 
         The drives of a machine's legs are made alike.
         """
-        low, high = situation.workspace
-        travels, joints, count = (high - low).tolist(), situation.mechanism.joints, len(_HARMONICS)
+        (low, high), rows = situation.workspace, situation.joints.flatten(0, -2)
+        measured = (rows.amax(0) - rows.amin(0)).nan_to_num(0.0)
+        travels = torch.maximum(measured, _LEAST_TRAVEL * (high - low)).tolist()
+        joints, count = situation.mechanism.joints, len(_HARMONICS)
         alike = any(p.leg is not None for p in situation.mechanism.geometry)
         if alike:
             travels = [max(t for t, other in zip(travels, joints, strict=True) if other.unit == j.unit) for j in joints]
@@ -187,6 +192,7 @@ def _frequencies(unit: str, travel: float) -> tuple[float, ...]:
     """Grid of a joint's frequencies, ascending [rad per joint's unit]."""
     if unit == "rad":
         return tuple(float(k) for k in range(1, _MOST_PER_TURN + 1))
-    steps = round((_PERIODS[1] - _PERIODS[0]) / _PERIOD_STEP)
-    whole = 2 * math.pi / max(travel, 1e-6)
-    return tuple(whole * (_PERIODS[0] + _PERIOD_STEP * k) for k in range(steps + 1))
+    travel = max(travel, 1e-6)
+    most = min(max(travel / _SHORTEST_LEAD, 2 * _FEWEST_PERIODS), _MOST_PERIODS)
+    steps = round((most - _FEWEST_PERIODS) / _PERIOD_STEP)
+    return tuple(2 * math.pi / travel * (_FEWEST_PERIODS + _PERIOD_STEP * k) for k in range(steps + 1))

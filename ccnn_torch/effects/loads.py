@@ -35,14 +35,12 @@ def members(mechanism: Mechanism) -> list[Member]:
         parameter = mechanism.geometry[k]
         if parameter.unit != "m":
             continue
-        name, leg, joint = parameter.name, None, None
-        if parameter.word:
-            name = parameter.word
-        elif isinstance(mechanism, SerialArm):
+        name, leg, joint = parameter.word or parameter.name, parameter.leg, None
+        if leg is not None:
+            name = f"leg {leg}"
+        elif not parameter.word and isinstance(mechanism, SerialArm):
             i = place * len(mechanism.joints) // len(own)
             name, joint = f"link {i + 1}", mechanism.joints[i].name
-        elif parameter.leg is not None:
-            name, leg = f"leg {parameter.leg}", parameter.leg
         if name not in found:
             found[name] = Member(name, [], leg, joint)
         found[name].lengths.append(k)

@@ -30,6 +30,8 @@ class Coefficient:
             one.
         mends: whether it is but a correction of the form of the others, and cannot be many times as large as they are.
         positive: whether physics allows it no negative value (backlash, compliance); for drawing it in a simulation.
+        by: name of a covariate beyond the effect's own that alone drives it: it may be there without the other
+            secondary ones; empty = none.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Coefficient:
     borrowed: bool = False
     mends: bool = False
     positive: bool = False
+    by: str = ""
 
 
 @dataclass(frozen=True)

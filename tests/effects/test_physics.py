@@ -23,6 +23,7 @@ from ccnn_torch.effects import (
     signature,
 )
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
+from ccnn_torch.effects.loads import members
 from ccnn_torch.effects.time import REFERENCE, lagged, velocity
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
@@ -321,6 +322,24 @@ def test_a_gears_error_comes_back_after_its_period() -> None:
     for i, shape in enumerate(effect.shapes(rows)):
         moved = [effect.coefficients(rows)[k].joint for k in shape.columns or ()]
         assert moved == [f"q{i + 1}"] * 8
+
+
+@pytest.mark.parametrize(("travel", "lead"), [(1.0, 10e-3), (0.12, 5e-3), (0.12, 2e-3)])
+def test_screws_of_usual_leads_are_looked_for_over_the_travel_of_the_rows(travel: float, lead: float) -> None:
+    rows = situation(str(GANTRY))
+    rows = replace(rows, joints=torch.linspace(0.2, 0.2 + travel, 9, dtype=torch.float64)[:, None].expand(9, 3))
+    grid = torch.tensor(make_effect("transmission").shapes(rows)[0].grid)
+    # A wave between two neighbours of the grid is seen by both.
+    assert float((grid - 2 * math.pi / lead).abs().min()) < 2 * math.pi / travel / 4
+
+
+def test_lengths_of_a_leg_grow_together_in_a_machine_file_as_in_the_drawing(tmp_path: Path) -> None:
+    file = tmp_path / "machine.yaml"
+    file.write_text(
+        "{machine: hexapod, numbers: {base_radius: 280 mm, platform_radius: 160 mm, base_spread: 12 deg, "
+        "platform_spread: 12 deg, height: 420 mm}}"
+    )
+    assert [m.name for m in members(load_mechanism(str(file)))] == [m.name for m in members(load_mechanism("stewart"))]
 
 
 def test_a_random_walk_has_the_variance_of_its_time() -> None:

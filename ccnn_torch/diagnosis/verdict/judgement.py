@@ -172,7 +172,7 @@ def in_order_of_library(
     if not inside:
         return verdict
     # Where the data ask for implausible sizes, these tell apart what the columns do not.
-    least = max(e.best.log_evidence for e in inside) - math.log(ODDS)
+    least = chosen.best.log_evidence - math.log(ODDS)
     same = [e for e in inside if e.best.log_evidence > least and is_same(e)]
     told = min(
         (e for e in same if is_before(e) and _is_least(analysis, e.best.members)),
