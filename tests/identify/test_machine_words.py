@@ -9,9 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from ccnn_torch.compensation import load_compensation
+from ccnn_torch.errors import InputError
 from ccnn_torch.identification.page import printer_table
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.kinds.machine_file import template
@@ -173,6 +175,17 @@ def test_a_coupling_of_a_scara_is_told_by_the_turn(tmp_path: Path, cli: Cli) -> 
     assert code == 0
     page = (tmp_path / "why" / "diagnosis.md").read_text()
     assert "quill coupling 0.1" in page and "mm/turn" in page
+
+
+def test_a_machine_file_takes_a_tool_offset_as_a_check_tells_to_write_it(tmp_path: Path) -> None:
+    path, text = tmp_path / "scara.yaml", template("scara")
+    path.write_text(text.replace("tool_frame: identity", "tool_offset: unknown"))
+    assert "tool" in load_mechanism(str(path)).unknown_frames
+    path.write_text(text.replace("tool_frame: identity", "tool_offset: [40 mm, 0, 0]"))
+    assert load_mechanism(str(path)).nominal[-6:-3].tolist() == [0.04, 0.0, 0.0]
+    path.write_text(text + "tool_offset: unknown\n")
+    with pytest.raises(InputError, match="remove one"):
+        load_mechanism(str(path))
 
 
 def _printer(folder: Path) -> Path:
