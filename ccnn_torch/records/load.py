@@ -108,6 +108,8 @@ def _check_alike(first: Table, other: Table) -> None:
 
 # Two turns of a joint, rounded up as the limit of a pose angle is.
 JOINT_LIMIT = 12.6
+# A joint is beyond its limits by more than rounding [rad or m]; in more than this share of the rows that is said.
+_AT_LIMIT, _MANY = 1e-6, 0.1
 # The tool of an arm whose frames are unknown may lengthen its reach by this share.
 _TOOL_ALLOWANCE = 0.25
 
@@ -131,7 +133,7 @@ class Records:
         lines: line of each row in the file, `rows`, int64.
         data_hash: SHA-256 of headers and values.
         parts: where rows are from, in order: file and number of its rows; empty for a single file.
-        doubt: a sentence on joints of commanded poses that may be others; empty without.
+        doubt: on joints of commanded poses that may be others, or that the machine's limits exclude; empty without.
     """
 
     path: str
@@ -228,6 +230,7 @@ def load_records(
     if fitting is not None and len(coordinates) in (3, 6) and not joint_map and is_open(as_read, mechanism.joints):
         there, doubt = fitting(torch.from_numpy(joints), torch.from_numpy(pose))
         joints = there.numpy()
+    doubt = " ".join(filter(None, [doubt, _beyond_limits(mechanism, joints)]))
     used = {joint.name for joint in mechanism.joints} | set(read)
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
@@ -348,6 +351,23 @@ def _refuse_without_given(
                 f"{table.path}: column '{name}' is empty at {table.name_rows(wrong)}, where {', '.join(reads)} was "
                 "read; say what it was read of"
             )
+
+
+def _beyond_limits(mechanism: Moving, joints: NDArray[np.float64]) -> str:
+    """A sentence where many rows are beyond the limits of a joint that the machine's file names; else empty."""
+    limits = getattr(mechanism, "limits", None)
+    if limits is None or not getattr(mechanism, "recipe", {}).get("keys", {}).get("limits"):
+        return ""
+    low, high = limits.numpy().T
+    beyond = ((joints < low - _AT_LIMIT) | (joints > high + _AT_LIMIT)).sum(0)
+    most = _MANY * len(joints)
+    said = [f"{joint.name} in {n}" for joint, n in zip(mechanism.joints, beyond, strict=True) if n > most]
+    if not said:
+        return ""
+    return (
+        f"joints are beyond the limits of the machine's file (key limits), {', '.join(said)} of {len(joints)} rows: no "
+        "command will go there, so correct the limits if the machine does"
+    )
 
 
 def _loaded(

@@ -17,7 +17,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.page import printer_table
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.kinds.machine_file import template
-from ccnn_torch.records import write_table
+from ccnn_torch.records import load_records, write_table
 
 Cli = Callable[..., tuple[int, str, str]]
 Array = NDArray[np.float64]
@@ -186,6 +186,16 @@ def test_a_machine_file_takes_a_tool_offset_as_a_check_tells_to_write_it(tmp_pat
     path.write_text(text + "tool_offset: unknown\n")
     with pytest.raises(InputError, match="remove one"):
         load_mechanism(str(path))
+
+
+def test_rows_beyond_the_limits_of_the_file_say_so(tmp_path: Path) -> None:
+    """They were identified from in silence, and commands were held at the limits."""
+    (tmp_path / "gantry.yaml").write_text(template("gantry"))
+    q = np.random.default_rng(0).uniform([0, 0, -0.3], [0.6, 0.4, 0], (30, 3))
+    columns = {f"q{k + 1}[m]": q[:, k] for k in range(3)} | {f"{a}[m]": q[:, k] for k, a in enumerate("xyz")}
+    write_table(tmp_path / "r.csv", columns)
+    found = load_records(str(tmp_path / "r.csv"), load_mechanism(str(tmp_path / "gantry.yaml")))
+    assert "beyond the limits of the machine's file (key limits), q3 in 30 of 30 rows" in found.doubt
 
 
 def _printer(folder: Path) -> Path:
