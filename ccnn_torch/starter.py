@@ -30,7 +30,7 @@ from ccnn_torch.records.table import PAYLOAD, Table
 from ccnn_torch.spelling import matching
 from ccnn_torch.units import si_unit_of, to_si
 
-_JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta)0*(\d+)")
+_JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta|leg)0*(\d+)")
 # As drivers write them: actual_q_0, arm_1_joint, left_joint3.
 _OTHER_JOINT = re.compile(
     r"(?=.*(?:joint|axis|q\d))(?!.*(?:target|goal|com|cmd|desired|soll|guess|speed|vel|torque|effort|cur|temp|dir))"
