@@ -108,7 +108,8 @@ def _check_alike(first: Table, other: Table) -> None:
 
 # Two turns of a joint, rounded up as the limit of a pose angle is.
 JOINT_LIMIT = 12.6
-# A joint is beyond its limits by more than rounding [rad or m]; in more than this share of the rows that is said.
+# A joint is beyond its limits by more than rounding [rad or m]; in more than this share of the rows that is said, as
+# are directions of 0.
 _AT_LIMIT, _MANY = 1e-6, 0.1
 # The tool of an arm whose frames are unknown may lengthen its reach by this share.
 _TOOL_ALLOWANCE = 0.25
@@ -133,7 +134,8 @@ class Records:
         lines: line of each row in the file, `rows`, int64.
         data_hash: SHA-256 of headers and values.
         parts: where rows are from, in order: file and number of its rows; empty for a single file.
-        doubt: on joints of commanded poses that may be others, or that the machine's limits exclude; empty without.
+        doubt: on joints of commanded poses that may be others, joints beyond the machine's limits, and directions of
+            0 and 1; empty without.
     """
 
     path: str
@@ -230,11 +232,11 @@ def load_records(
     if fitting is not None and len(coordinates) in (3, 6) and not joint_map and is_open(as_read, mechanism.joints):
         there, doubt = fitting(torch.from_numpy(joints), torch.from_numpy(pose))
         joints = there.numpy()
-    doubt = " ".join(filter(None, [doubt, _beyond_limits(mechanism, joints)]))
     used = {joint.name for joint in mechanism.joints} | set(read)
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
     chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates)
+    doubt = "; ".join(filter(None, [doubt, _beyond_limits(mechanism, joints), _half_signs(table, chosen)]))
     unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
     lacking = {c.name for c in mechanism.pose} - {c.name for c in coordinates}
     if orientation == "none":
@@ -367,6 +369,18 @@ def _beyond_limits(mechanism: Moving, joints: NDArray[np.float64]) -> str:
     return (
         f"joints are beyond the limits of the machine's file (key limits), {', '.join(said)} of {len(joints)} rows: no "
         "command will go there, so correct the limits if the machine does"
+    )
+
+
+def _half_signs(table: Table, chosen: Sequence[Coordinate]) -> str:
+    """A sentence where directions of motion are 0 and 1 in the place of -1 and 1; else empty."""
+    names = [c.name for c in chosen if c.name.startswith("direction")]
+    # A joint that moves one way alone has few rows before its first motion.
+    wrong = [n for n in names if set(table.raw(n)) == {0.0, 1.0} and np.mean(table.raw(n) == 0) > _MANY]
+    if not wrong:
+        return ""
+    return (
+        f"{', '.join(wrong)} are 0 or 1 and never -1: write the sign of the motion, or backlash is told twice as large"
     )
 
 
