@@ -379,9 +379,7 @@ def _half_signs(table: Table, chosen: Sequence[Coordinate]) -> str:
     wrong = [n for n in names if set(table.raw(n)) == {0.0, 1.0} and np.mean(table.raw(n) == 0) > _MANY]
     if not wrong:
         return ""
-    return (
-        f"{', '.join(wrong)} are 0 or 1 and never -1: write the sign of the motion, or backlash is told twice as large"
-    )
+    return f"{', '.join(wrong)}: 0 or 1, and never -1; write the sign of the motion, or backlash is told twice as large"
 
 
 def _loaded(
