@@ -26,11 +26,11 @@ from ccnn_torch.records.commanded import GOAL
 from ccnn_torch.records.formats import form_of
 from ccnn_torch.records.headers import EULER_ANGLES
 from ccnn_torch.records.load import load_records, read_source
-from ccnn_torch.records.table import Table
+from ccnn_torch.records.table import PAYLOAD, Table
 from ccnn_torch.spelling import matching
 from ccnn_torch.units import si_unit_of, to_si
 
-_JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta)0*(\d+)")
+_JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta|leg)0*(\d+)")
 # As drivers write them: actual_q_0, arm_1_joint, left_joint3.
 _OTHER_JOINT = re.compile(
     r"(?=.*(?:joint|axis|q\d))(?!.*(?:target|goal|com|cmd|desired|soll|guess|speed|vel|torque|effort|cur|temp|dir))"
@@ -470,7 +470,8 @@ def _count_lines(
 def _other_lines(found: Recognised, table: Table) -> list[str]:
     inputs = [name for name in matching(found.unknown, DEFAULT_COVARIATES) if table.units[name]]
     inputs += [target.partition("[")[0] for target in found.inputs.values()]
-    ignored = [name for name in found.unknown if not matching([name], DEFAULT_COVARIATES)]
+    read = {*DEFAULT_COVARIATES, *([PAYLOAD] if "load_z" in inputs else [])}
+    ignored = [name for name in found.unknown if not matching([name], [*read])]
     lines = [f"# Inputs beside the joints, by their names: {', '.join(inputs)}."] if inputs else []
     if ignored:
         lines.append(f"# Not used: {', '.join(ignored)}. `covariates: [NAME]` makes one an input.")

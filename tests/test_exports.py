@@ -188,3 +188,9 @@ def test_a_plain_table_stays_one(tmp_path: Path) -> None:
     # A title is passed over with a note.
     path.write_text("Line 4, May\nq1[rad];x[mm];t[s]\n1,5;2,5;1\n1,5;2,5;2\n")
     assert read_table(path).raw("q1").tolist() == [1.5, 1.5] and "passed over" in read_table(path).notes[0]
+
+
+def test_a_row_of_units_counts_from_the_left_where_its_last_cells_are_blank(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text("q1,q2,x,y,qw,note\nmm,deg,mm,mm,,\n" + "1,2,3,4,1,5\n" * 5)
+    assert [*read_table(path).units.values()] == ["mm", "deg", "mm", "mm", "", ""]

@@ -136,7 +136,12 @@ def test_joints_as_a_urdf_and_as_drivers_name_them(tmp_path: Path) -> None:
     )
     links = "".join(f'<link name="l{k}"/>' for k in range(4))
     (tmp_path / "r.urdf").write_text(f'<robot name="r">{links}{chain}</robot>')
-    for theirs in (["pan.pos", "lift.pos", "elbow.pos"], ["actual_q_0", "actual_q_1", "actual_q_2"], ["arm_1_joint"]):
+    for theirs in (
+        ["pan.pos", "lift.pos", "elbow.pos"],
+        ["actual_q_0", "actual_q_1", "actual_q_2"],
+        ["Leg 1", "Leg 2", "Leg 3"],
+        ["arm_1_joint"],
+    ):
         names = [f"arm_{k}_joint" for k in (1, 2, 3)] if len(theirs) == 1 else theirs
         path = write(tmp_path / "r.csv", [*names, "speed_q_0", "x", "y", "z"], np.ones((9, 7)))
         text, _ = starter_config(path, tmp_path / "c.yaml", str(tmp_path / "r.urdf"), "mm,deg")

@@ -10,8 +10,10 @@ import torch
 from test_records import ROWS, Arm, Slide, arm_columns, slide_columns
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import Records, load_records, write_table
+from ccnn_torch.records.headers import pose_columns
 
 ANGLES = np.random.default_rng(8).uniform([-170, -80, -170], [170, 80, 170], (ROWS, 3))
 
@@ -111,6 +113,26 @@ def test_what_is_no_orientation_or_is_not_missed_passes(tmp_path: Path) -> None:
     assert found.orientation == "rotation_vector" and any("ignored columns: A, B, C" in note for note in found.notes)
     write_table(tmp_path / "records.csv", slide_columns() | {"roll[deg]": ANGLES[:, 0]})
     assert any("roll" in note for note in load_records(tmp_path / "records.csv", Slide()).notes)
+
+
+def test_a_hexapod_takes_a_quaternion_and_a_controllers_angles(tmp_path: Path) -> None:
+    """They were left out in silence, and a part of the pose was compared."""
+    machine = load_mechanism("stewart")
+    joints = machine.sample_joints(20, torch.Generator().manual_seed(0))
+    pose = machine.forward_kinematics(joints).numpy()
+    told = {c.header: joints[:, k].numpy() for k, c in enumerate(machine.joints)}
+    told |= {f"{name}[m]": pose[:, k] for k, name in enumerate("xyz")}
+    for form, unit in (("quaternion", "[1]"), ("kuka", "[rad]")):
+        turned = {name + unit: values for name, values in pose_columns(pose, form).items()}
+        write_table(tmp_path / "records.csv", told | turned)
+        np.testing.assert_allclose(load_records(tmp_path / "records.csv", machine).pose, pose, atol=1e-12)
+
+
+def test_a_rotation_matrix_is_refused_and_not_lost(tmp_path: Path) -> None:
+    names = [f"r{i}{k}" for i in (1, 2, 3) for k in (1, 2, 3)]
+    write_table(tmp_path / "records.csv", arm_columns("none") | {f"{n}[1]": ANGLES[:, 0] for n in names})
+    with pytest.raises(InputError, match="would not be used; a matrix is not read, give the quaternion"):
+        load_records(tmp_path / "records.csv", Arm())
 
 
 def test_angles_that_are_not_complete(tmp_path: Path) -> None:

@@ -234,3 +234,11 @@ def test_table_keeps_what_its_map_keeps(tmp_path: Path) -> None:
     table: Table = read_table(german(tmp_path), {"Datum": "ignore", "Bemerkung": "ignore", "Weg": "q1[mm]"})
     assert table.names == ("q1", "A1", "Y", "PHI", "Temp", "column 8")
     assert table.header("A1") == "A1" and table.header("q1") == "q1[mm]"
+
+
+def test_thousands_and_a_row_that_breaks_off_are_told_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text("q1[mm],q2[deg],y[mm],phi[rad]\n" + '"1,234.5",0.2,0.3,0.4\n' * 9)
+    refused(path, "write numbers without thousands separators")
+    path.write_text("q1[mm],q2[deg],y[mm],phi[rad]\n" + "0.1,0.2,0.3,0.4\n" * 9 + "0.1,0.")
+    assert "semicolons" not in refused(path, "has 2 cells")

@@ -360,3 +360,11 @@ def test_a_joint_more_than_the_machine_has_is_no_input_without_a_word(tmp_path: 
     assert "'q3', and the machine has 2 joints" in fails(tmp_path, columns, Slide())
     write_table(tmp_path / "more.csv", columns)
     assert len(load_records(tmp_path / "more.csv", Slide(), columns={"q3": "ignore"}).joint_coordinates) == 2
+
+
+def test_directions_without_a_minus_are_doubted(tmp_path: Path) -> None:
+    """Backlash was told twice as large."""
+    up = np.arange(ROWS) % 2
+    for low, doubted in ((0, True), (-1, False)):
+        write_table(tmp_path / "r.csv", slide_columns() | {"direction1[1]": np.where(up == 1, 1.0, low)})
+        assert ("direction1: 0 or 1, and never -1" in load_records(tmp_path / "r.csv", Slide()).doubt) == doubted

@@ -31,9 +31,11 @@ from ccnn_torch.mechanisms import (
     load_mechanism,
     set_ups,
 )
+from ccnn_torch.mechanisms.frames.judge import far_rows
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Split
+from ccnn_torch.records.table import PAYLOAD
 from ccnn_torch.units import si_unit_of
 
 # Each round of `command` shrinks the remainder by about the relative size of the errors.
@@ -186,7 +188,15 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
     start = mechanism.nominal[None] if held_by_priors(config, mechanism) else _start(mechanism, train, columns)
     far = list[str]()
     if isinstance(mechanism, SerialArm):
-        far = judge_frames(mechanism, train.joints[0], train.observed[0], start, where=records.path)
+        about = train.joints[0], train.observed[0], start
+        named = split.train.numpy()
+        far = judge_frames(mechanism, *about, where=records.path, name_rows=lambda rows: records.name_rows(named[rows]))
+        if far:
+            error = mechanism.pose_error(mechanism.forward_kinematics(about[0], start), about[1])
+            sound = ~far_rows(error, ~about[1].isnan().any(-1))[1].reshape(-1)
+            split = replace(split, train=split.train[sound])
+            train, test = rows_of_split(records, split)
+            start = start[:, sound] if start.dim() > 2 else start
     joint_noise = None
     if config.joint_noise is not None:
         joint_noise = sizes_of_joints(config.joint_noise, mechanism.joints, "joint_noise")
@@ -315,4 +325,11 @@ def _refuse_unseen(groups: Sequence[tuple[str, Tensor]], split: Split, records: 
 
 def notes_of(records: Records) -> list[str]:
     """Without those of columns that are no inputs here."""
-    return [note for note in records.notes if not note.startswith(("ignored columns", "column '"))]
+    loads = [name for name in records.columns if name.startswith("load_") and np.ptp(records.columns[name]) > 0]
+    notes = [note for note in records.notes if not note.startswith(("ignored columns", "column '", f"{PAYLOAD}["))]
+    if loads:
+        notes.append(
+            f"{', '.join(loads)} {'acts' if len(loads) == 1 else 'act'} on no parameter of the geometry and "
+            f"{'was' if len(loads) == 1 else 'were'} not used: ccnn diagnose and ccnn run find what gives under a load"
+        )
+    return notes

@@ -115,11 +115,12 @@ def identified_verdict(results: Block) -> str:
         parts.append(f"{name} {before} → {after} RMS{mean}")
     rows = count_text(results["rows"]["test"], "held-out pose")
     machines = f" of {results['machines']} machines" if results["machines"] > 1 else ""
+    nearer = "nearer to" if all(block["after"] < block["before"] for _, block in named) else "not nearer to"
     if "constraint" in results:
         rows = count_text(results["rows"]["test"], "held-out row")
-        text = f"On {rows} the tool is nearer to where {holder(results)} it: "
+        text = f"On {rows} the tool is {nearer} where {holder(results)} it: "
     else:
-        text = f"On {rows}{machines} the predicted pose is nearer to the measured one: "
+        text = f"On {rows}{machines} the predicted pose is {nearer} the measured one: "
     if results["methods"][method]["converged"] == 0:
         return f"{failed} Its error on {rows}{machines}: {', '.join(parts)}."
     return f"{failed} {text}".lstrip() + ", ".join(parts) + "."

@@ -187,6 +187,8 @@ _TOGETHER = {
 _TURN = re.compile(
     r"r[xyz]|rot[xyz]|rotvec\w*|roll|pitch|yaw|euler\w*|q[wxyz]|quat\w*|orient\w*|(kuka|fanuc|staubli)\w+"
 )
+# An entry of a matrix by its row and column.
+_MATRIX = re.compile(r"(?:r|t|m|rot)[0-3][0-3]")
 _JOINT = re.compile(r"(?:q|j|a|e|joint|axis|axe|achse|theta)0*(\d+)")
 
 
@@ -243,7 +245,12 @@ def read_pose(
 
     if partial:
         table = _without_empty(table, mechanism)
-    if not mechanism.orientations:
+    names = {c.name for c in mechanism.pose}
+    # Any machine that turns about three axes may have its orientation in another form than its own coordinates.
+    turns_freely = set(_ROTATION_VECTOR) <= names and any(
+        named.format(c) in table for c in (*_QUATERNION, *(c for columns, _ in EULER_ANGLES.values() for c in columns))
+    )
+    if not mechanism.orientations and not turns_freely:
         pose = _measured(table, mechanism.pose, mechanism) if partial else mechanism.pose
         pose = tuple(pose or mechanism.pose)
         return _together(stacked(pose, _POSE_LIMIT), pose), pose, None, tuple(named.format(c.name) for c in pose)
@@ -369,12 +376,17 @@ def check_orientation(table: Table, mechanism: HasCoordinates, unused: Iterable[
     folded = {_folded(name): name for name in unused if _may_be_angle(table.units[name])}
     together = next((letters for letters in _TOGETHER if all(letter in folded for letter in letters)), ())
     found = [folded[letter] for letter in together] or [name for key, name in folded.items() if _TURN.fullmatch(key)]
+    matrix = [name for key, name in folded.items() if _MATRIX.fullmatch(key)]
+    turned = not found and len(matrix) >= 9
+    found = matrix if turned else found
     if not found:
         return
     meant = _TOGETHER.get(together) if together else None
     if meant is not None:
         pairs = (f'"{table.header(n)}": "{m}[{table.units[n] or "deg"}]"' for n, m in zip(found, meant, strict=True))
         say = f"write columns: {{{', '.join(pairs)}}} if they are"
+    elif turned:
+        say = f"a matrix is not read, give the quaternion {', '.join(_QUATERNION)} (scipy: Rotation.from_matrix)"
     else:
         known = [_ROTATION_VECTOR, _QUATERNION, *(columns for columns, _ in EULER_ANGLES.values())]
         say = f"map them with columns: to one of {'; '.join(', '.join(names) for names in known)}"

@@ -108,6 +108,9 @@ def _check_alike(first: Table, other: Table) -> None:
 
 # Two turns of a joint, rounded up as the limit of a pose angle is.
 JOINT_LIMIT = 12.6
+# A joint is beyond its limits by more than rounding [rad or m]; in more than this share of the rows that is said, as
+# are directions of 0.
+_AT_LIMIT, _MANY = 1e-6, 0.1
 # The tool of an arm whose frames are unknown may lengthen its reach by this share.
 _TOOL_ALLOWANCE = 0.25
 
@@ -131,7 +134,8 @@ class Records:
         lines: line of each row in the file, `rows`, int64.
         data_hash: SHA-256 of headers and values.
         parts: where rows are from, in order: file and number of its rows; empty for a single file.
-        doubt: a sentence on joints of commanded poses that may be others; empty without.
+        doubt: on joints of commanded poses that may be others, joints beyond the machine's limits, and directions of
+            0 and 1; empty without.
     """
 
     path: str
@@ -232,6 +236,7 @@ def load_records(
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
     chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates)
+    doubt = "; ".join(filter(None, [doubt, _beyond_limits(mechanism, joints), _half_signs(table, chosen)]))
     unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
     lacking = {c.name for c in mechanism.pose} - {c.name for c in coordinates}
     if orientation == "none":
@@ -348,6 +353,33 @@ def _refuse_without_given(
                 f"{table.path}: column '{name}' is empty at {table.name_rows(wrong)}, where {', '.join(reads)} was "
                 "read; say what it was read of"
             )
+
+
+def _beyond_limits(mechanism: Moving, joints: NDArray[np.float64]) -> str:
+    """A sentence where many rows are beyond the limits of a joint that the machine's file names; else empty."""
+    limits = getattr(mechanism, "limits", None)
+    if limits is None or not getattr(mechanism, "recipe", {}).get("keys", {}).get("limits"):
+        return ""
+    low, high = limits.numpy().T
+    beyond = ((joints < low - _AT_LIMIT) | (joints > high + _AT_LIMIT)).sum(0)
+    most = _MANY * len(joints)
+    said = [f"{joint.name} in {n}" for joint, n in zip(mechanism.joints, beyond, strict=True) if n > most]
+    if not said:
+        return ""
+    return (
+        f"joints are beyond the limits of the machine's file (key limits), {', '.join(said)} of {len(joints)} rows: no "
+        "command will go there, so correct the limits if the machine does"
+    )
+
+
+def _half_signs(table: Table, chosen: Sequence[Coordinate]) -> str:
+    """A sentence where directions of motion are 0 and 1 in the place of -1 and 1; else empty."""
+    names = [c.name for c in chosen if c.name.startswith("direction")]
+    # A joint that moves one way alone has few rows before its first motion.
+    wrong = [n for n in names if set(table.raw(n)) == {0.0, 1.0} and np.mean(table.raw(n) == 0) > _MANY]
+    if not wrong:
+        return ""
+    return f"{', '.join(wrong)}: 0 or 1, and never -1; write the sign of the motion, or backlash is told twice as large"
 
 
 def _loaded(

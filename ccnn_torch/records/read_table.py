@@ -408,7 +408,8 @@ def _read_cells(
     bad: dict[tuple[int, int], str] = {}
     for row, cells in enumerate(rows):
         if len(cells) != header.width:
-            comma = "; with a decimal comma, separate the cells by semicolons" if separator == "," else ""
+            more = separator == "," and len(cells) > header.width
+            comma = "; with a decimal comma, separate the cells by semicolons" if more else ""
             counts = f"has {len(cells)} cells, but the header names {header.width} columns"
             raise InputError(f"{file}: {name_lines(lines, [row], start=start)} {counts}{comma}")
         for column, cell in enumerate(cells):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,8 @@ from ccnn_torch.units import LARGEST, parse_header, si_unit_of, split_header, to
 
 FILE = "file"
 """The column that numbers the files where there are several: 0, 1, …"""
+# A number with thousands separators: two of them, or one and another mark before the decimals.
+_GROUPED = re.compile(r"-?\d{1,3}(?:([., ])\d{3}(?:\1\d{3})+(?:[.,]\d*)?|([., ])\d{3}(?!\2)[.,]\d+)")
 PAYLOAD = "payload"
 """A column that is read as a load where it has a mass, and no other column has a load."""
 
@@ -133,10 +136,10 @@ class Table:
             text = visible(self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}"), 40)
             what = f"has '{text}'" if text else "is empty"
             more = f", and {len(wrong) - 1} more of its cells are not finite either" if len(wrong) > 1 else ""
-            raise InputError(
-                f"{self.path}: column '{name}' {what} at {self.name_rows([row])}{more}; "
-                "write a finite number or remove the row"
-            )
+            remedy = "write a finite number or remove the row"
+            if _GROUPED.fullmatch(text):
+                remedy = "write numbers without thousands separators"
+            raise InputError(f"{self.path}: column '{name}' {what} at {self.name_rows([row])}{more}; {remedy}")
         converted = to_si(values, unit or "1", si_unit, f"{self.path}: column '{name}'", name)
         far = np.flatnonzero(np.abs(converted) > LARGEST)
         if len(far):

@@ -120,6 +120,15 @@ def test_some_machines_that_did_not_converge_are_named_first() -> None:
     assert identified_verdict(results).startswith("lm did not converge on 1 of 4 machines, which the standard")
 
 
+def test_an_error_that_grew_is_not_called_nearer(tmp_path: Path) -> None:
+    from ccnn_torch.identification.page import identified_verdict
+
+    block = {"before": 1e-3, "after": 2e-3, "unit": "m"}
+    results = {"test": {"position": block, "rotation": None}, "method": "lm", "machines": 1, "rows": {"test": 9}}
+    results["methods"] = {"lm": {"converged": 1, "machines": 1}}
+    assert "the predicted pose is not nearer to the measured one" in identified_verdict(results)
+
+
 def test_a_noise_that_does_not_fit_the_rows_is_doubted(tmp_path: Path) -> None:
     path = records(tmp_path / "rows.csv", "five_bar", noise=1e-4)
     keys = {"mechanism": "five_bar", "records": str(path), "frame": {"base": True}, "parameters": FIVE_BAR_FREE}

@@ -12,10 +12,10 @@ from scipy.optimize import approx_fprime, least_squares
 import ccnn_torch
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.identify import Identification
-from ccnn_torch.identification.measured import make_kinematics
+from ccnn_torch.identification.measured import make_kinematics, notes_of
 from ccnn_torch.identification.simulated import Places, PointsView
 from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
-from ccnn_torch.records import write_table
+from ccnn_torch.records import load_records, write_table
 
 FIVE_BAR: dict[str, Any] = {
     "machines": 60,
@@ -216,6 +216,31 @@ def test_an_arm_from_records_out_again_as_dh_file_and_urdf(tmp_path: Path) -> No
         again = load_mechanism(str(tmp_path / "out" / name))
         assert isinstance(again, SerialArm)
         assert float((again.forward_frame(joints)[0] - expected[0]).norm(dim=-1).max()) < 2e-4
+
+
+def test_links_are_fitted_without_gross_outliers_and_the_note_names_their_lines(tmp_path: Path) -> None:
+    """A note said so, and the links were fitted with them."""
+    rows, file, real = arm_rows(tmp_path)
+    lines = rows.read_text().splitlines()
+    for k in range(1, 41, 8):
+        cells = lines[k].split(",")
+        lines[k] = ",".join([*cells[:6], str(float(cells[6]) + 0.1), *cells[7:]])
+    rows.write_text("\n".join(lines))
+    found = ccnn_torch.identify(mechanism=str(file), records=str(rows), noise=1e-5, save_report=False)
+    (note,) = (note for note in found.measured.notes if "gross outlier" in note)
+    assert "fitted without: line" in note
+    joints = real.sample_joints(30, torch.Generator().manual_seed(9))
+    error = found.mechanism().forward_kinematics(joints) - real.forward_kinematics(joints)
+    assert float(error[:, :3].norm(dim=-1).max()) < 2e-4
+
+
+def test_a_payload_is_said_not_to_be_used(tmp_path: Path) -> None:
+    rows, file, _ = arm_rows(tmp_path)
+    lines = rows.read_text().splitlines()
+    rows.write_text("\n".join([f"{lines[0]},payload[kg]", *(f"{line},{k % 3}" for k, line in enumerate(lines[1:]))]))
+    found = load_records(str(rows), load_mechanism(str(file)), [], learns=False)
+    (note,) = (note for note in notes_of(found) if "load" in note)
+    assert note.startswith("load_z acts on no parameter of the geometry and was not used")
 
 
 def test_links_hold_where_the_arm_stands_elsewhere(tmp_path: Path) -> None:

@@ -9,13 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from ccnn_torch.compensation import load_compensation
+from ccnn_torch.errors import InputError
 from ccnn_torch.identification.page import printer_table
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.kinds.machine_file import template
-from ccnn_torch.records import write_table
+from ccnn_torch.records import load_records, write_table
 
 Cli = Callable[..., tuple[int, str, str]]
 Array = NDArray[np.float64]
@@ -173,6 +175,27 @@ def test_a_coupling_of_a_scara_is_told_by_the_turn(tmp_path: Path, cli: Cli) -> 
     assert code == 0
     page = (tmp_path / "why" / "diagnosis.md").read_text()
     assert "quill coupling 0.1" in page and "mm/turn" in page
+
+
+def test_a_machine_file_takes_a_tool_offset_as_a_check_tells_to_write_it(tmp_path: Path) -> None:
+    path, text = tmp_path / "scara.yaml", template("scara")
+    path.write_text(text.replace("tool_frame: identity", "tool_offset: unknown"))
+    assert "tool" in load_mechanism(str(path)).unknown_frames
+    path.write_text(text.replace("tool_frame: identity", "tool_offset: [40 mm, 0, 0]"))
+    assert load_mechanism(str(path)).nominal[-6:-3].tolist() == [0.04, 0.0, 0.0]
+    path.write_text(text + "tool_offset: unknown\n")
+    with pytest.raises(InputError, match="remove one"):
+        load_mechanism(str(path))
+
+
+def test_rows_beyond_the_limits_of_the_file_say_so(tmp_path: Path) -> None:
+    """They were identified from in silence, and commands were held at the limits."""
+    (tmp_path / "gantry.yaml").write_text(template("gantry"))
+    q = np.random.default_rng(0).uniform([0, 0, -0.3], [0.6, 0.4, 0], (30, 3))
+    columns = {f"q{k + 1}[m]": q[:, k] for k in range(3)} | {f"{a}[m]": q[:, k] for k, a in enumerate("xyz")}
+    write_table(tmp_path / "r.csv", columns)
+    found = load_records(str(tmp_path / "r.csv"), load_mechanism(str(tmp_path / "gantry.yaml")))
+    assert "beyond the limits of the machine's file (key limits), q3 in 30 of 30 rows" in found.doubt
 
 
 def _printer(folder: Path) -> Path:

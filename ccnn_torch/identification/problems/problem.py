@@ -75,7 +75,7 @@ def check_equations(problem: Problem) -> None:
         needed, priors = -(-(k - held) // channels), f" and {held} priors" if held else ""
         raise InputError(
             f"{rows} rows of {count_text(channels, 'equation')}{priors} cannot determine {k} free parameters; "
-            f"measure at least {needed} rows, or fix parameters"
+            f"measure at least {needed} rows beside those that are held out, or fix parameters"
         )
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form, fit_frames, whole_rows
 from ccnn_torch.mechanisms.machines.serial import SerialArm
+from ccnn_torch.mechanisms.pose import PoseError
 from ccnn_torch.numerics.outliers import inlying
 
 # What the median row may be missed by, as a share of the arm's reach, and the orientation by [rad]. The worst arms that
@@ -57,14 +58,11 @@ def judge_frames(
     used = ((torch.ones(len(joints)) if weights is None else weights) > 0) & ~pose.isnan().any(-1)
     median = _median(error.position, used)
     turned = None if error.rotation is None else _median(error.rotation, used)
+    length, far = far_rows(error, used)
     rotation, place = arm.flange(joints)
     tool = place + (rotation @ values[..., -6:-3, None])[..., 0]
     motion = float((tool - tool.mean(-2, keepdim=True)).norm(dim=-1).square().mean(-1).sqrt().max())
     limit = min(_SHARE * arm.reach, _OF_MOTION * motion)
-    length = error.position if error.rotation is None else torch.hypot(error.position, ROTATION_WEIGHT * error.rotation)
-    length = length.nan_to_num()
-    channels, free = (3, 9) if error.rotation is None else (6, 12)
-    far = used & ~inlying(length, used, channels, free)
     # A sound model may miss a part of its rows by more than the others: something acts there.
     share = float(((far & (length > limit)).sum(-1) / used.expand(far.shape).sum(-1)).max())
     wrong = ""
@@ -90,7 +88,8 @@ def judge_frames(
         raise InputError(
             f"{where}: with base and tool frame fitted, {arm.name} still misses {wrong}, so this model does not "
             "describe these rows; check the units, the order, signs and zeros of the joints, the convention (standard "
-            "or modified), and whether this is the robot that was measured"
+            "or modified), and whether this is the robot that was measured; ccnn check "
+            "names a single mistake among these"
         )
     rows = torch.nonzero(far.reshape(-1, len(joints)).any(0)).squeeze(-1).tolist()
     if not rows:
@@ -101,6 +100,14 @@ def judge_frames(
         f"{len(rows)} {'row is a gross outlier' if len(rows) == 1 else 'rows are gross outliers'}, up to "
         f"{1e3 * size:.3g} mm off, and frames and links are fitted without{named}."
     ]
+
+
+def far_rows(error: PoseError, used: Tensor) -> tuple[Tensor, Tensor]:
+    """Length of each row's pose error, `... x s` [m], and whether the row is a gross outlier among those used, bool."""
+    length = error.position if error.rotation is None else torch.hypot(error.position, ROTATION_WEIGHT * error.rotation)
+    length = length.nan_to_num()
+    channels, free = (3, 9) if error.rotation is None else (6, 12)
+    return length, used & ~inlying(length, used, channels, free)
 
 
 def coupled_count(arm: SerialArm, joints: Tensor, pose: Tensor) -> str | None:

@@ -36,7 +36,7 @@ KINDS = tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 _BARE = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*")
 _TOLERANCE = re.compile(r"\+-|±")
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
-_OF_ARMS = ("base_frame", "tool_frame", "limits", "pitch_errors", "orientation", "frame_per", "tool_per")
+_OF_ARMS = ("base_frame", "tool_frame", "tool_offset", "limits", "pitch_errors", "orientation", "frame_per", "tool_per")
 _FRAME = ("m", "m", "m", "rad", "rad", "rad")
 
 
@@ -113,6 +113,12 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         key: _frame(content.get(f"{key}_frame", about[f"{key}_frame"]), f"{where}: {key}_frame")
         for key in ("base", "tool")
     }
+    if "tool_offset" in content:
+        if "tool_frame" in content:
+            raise InputError(f"{where}: tool_offset and tool_frame both say where the measured point is; remove one")
+        offset = content["tool_offset"]
+        point = [*offset, 0, 0, 0] if isinstance(offset, list) else offset
+        frames["tool"] = _frame(point, f"{where}: tool_offset")
     travel, joints = content.get("limits") or {}, [f"q{i + 1}" for i in range(len(moves))]
     if not isinstance(travel, Mapping):
         raise InputError(f"{where}: limits: must be as {{q1: [0 mm, 500 mm]}}, not {travel!r}")

@@ -209,6 +209,8 @@ def _names(above: Sequence[_Line], width: int, way: str) -> tuple[list[str], lis
     if rest and apart and len({*some}) < len(some) and len(rest[-1].cells) > 1:
         names = _under(rest.pop().cells, names)
     if len(units) > len(names):
+        units = _filled(units)
+    if len(units) > len(names):
         return [], []
     if units:
         # From the right, where the first ones are blank.
@@ -234,8 +236,8 @@ def _under(above: Sequence[str], names: Sequence[str]) -> list[str]:
 
 def _unit_row(cells: Sequence[str]) -> list[str]:
     """Units of a row that has nothing else; [] of another row."""
-    bare = _filled([cell.strip("[]() ") for cell in cells])
-    return bare if all(_kind(unit) for unit in bare if unit) else []
+    bare = [cell.strip("[]() ") for cell in cells]
+    return bare if all(_kind(unit) for unit in bare if unit) and any(bare) else []
 
 
 def _cells(line: str, way: str) -> list[str]:
