@@ -37,7 +37,7 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
     for rows in (60, 120, 240) if quick else (100, 1000, 10_000):
         data = training_rows(rows)
         x, y = data.inputs, data.targets
-        batch = [values.expand(STARTS, *values.shape[1:]) for values in (x, y, data.weights)]
+        inputs, targets, counts = (values.expand(STARTS, *values.shape[1:]) for values in (x, y, data.weights))
 
         def scipy_fit(x: torch.Tensor = x, y: torch.Tensor = y) -> object:
             return least_squares(
@@ -55,7 +55,7 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
             f"{ITERATIONS} iterations of Levenberg-Marquardt, {STARTS} networks 3-{HIDDEN}-3",
             rows,
             "rows",
-            partial(refinement.refine, masks, weights, *batch, ITERATIONS, warm_up=ITERATIONS),
+            partial(refinement.refine, masks, weights, inputs, targets, counts, ITERATIONS, warm_up=ITERATIONS),
             peers,
             rounds=1 if quick else 3,
         )

@@ -88,8 +88,8 @@ def judge_frames(
         raise InputError(
             f"{where}: with base and tool frame fitted, {arm.name} still misses {wrong}, so this model does not "
             "describe these rows; check the units, the order, signs and zeros of the joints, the convention (standard "
-            "or modified), and whether this is the robot that was measured; ccnn check "
-            "names a single mistake among these"
+            "or modified), and whether this is the robot that was measured; ccnn check names "
+            "a single mistake among these"
         )
     rows = torch.nonzero(far.reshape(-1, len(joints)).any(0)).squeeze(-1).tolist()
     if not rows:
