@@ -232,7 +232,7 @@ class LoadedModel:
         facts: the file's metadata, equal to the card where both have a key; of a machine the nominal one's `mechanism`.
         joints, covariates, pose: coordinates in order; geometry alone has no covariates.
         make: gives the compensator, where the file is no export.
-        session: of ONNX Runtime, where it is one.
+        session_of: gives a session of ONNX Runtime for some of the outputs, where it is one.
         machine: as an identification found it; None for a model that has learned.
         signed: whether a signature was asked for: then what no signature covers is not believed.
     """
@@ -244,7 +244,7 @@ class LoadedModel:
     covariates: tuple[Coordinate, ...]
     pose: tuple[Coordinate, ...]
     make: Callable[[], Compensator] | None
-    session: Any
+    session_of: Callable[[frozenset[str]], Any] | None
     machine: FoundMachine | None
     signed: bool
 
@@ -295,8 +295,10 @@ class LoadedModel:
 
     def run(self, joints: Array, covariates: Array | None, ways: Collection[str] = WAYS) -> dict[str, Array]:
         """What the file itself gives for joints `s x n` and covariates `s x m`; raises what it likes."""
-        if self.compensator is None:
-            return run_onnx(self.session, joints, covariates)
+        if self.session_of is not None:
+            outputs = frozenset(name for way in ways for name in (*_NUMBERS[way], *_FLAGS.get(way, ())))
+            return run_onnx(self.session_of(outputs), joints, covariates)
+        assert self.compensator is not None
         beside = None if covariates is None else torch.tensor(covariates)
         with torch.no_grad():
             found = self.compensator.run(torch.tensor(joints), beside, ways)
@@ -416,7 +418,7 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
         check_signature(path, content, card_content, public_key)
     try:
         with code_refused("its metadata", allow_code):
-            facts, compensator, session = open_model(path, content)
+            facts, compensator, session_of = open_model(path, content)
     except InputError as reason:
         raise ModelFileError(f"{path}: {reason}") from None
     different = [key for key in facts if card.get(key) != facts[key]]
@@ -427,7 +429,7 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
         )
     named: dict[str, Any] = {key: coordinates(facts[key]) for key in ("joints", "covariates", "pose")}
     make = None if compensator is None else lambda: compensator
-    about: dict[str, Any] = {"make": make, "session": session, "machine": None, "signed": public_key is not None}
+    about: dict[str, Any] = {"make": make, "session_of": session_of, "machine": None, "signed": public_key is not None}
     model = LoadedModel(path, card, facts, **named, **about)
     n, centre = len(model.joints), model._promise.centre[None]
     try:

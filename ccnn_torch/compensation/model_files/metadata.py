@@ -6,6 +6,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +15,7 @@ import onnx
 import onnxruntime
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
+from onnx.utils import Extractor
 from onnxruntime.capi import onnxruntime_pybind11_state as runtime
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
@@ -356,15 +358,15 @@ def _digest(facts: Mapping[str, Any]) -> str:
 
 
 def open_model(path: Path, content: bytes) -> tuple[dict[str, Any], Compensator | None, Any]:
-    """Facts, and the module or a session of ONNX Runtime, by what the name ends in.
+    """Facts, and the module, or what gives a session of ONNX Runtime for some of the outputs, by what the name ends in.
 
     Raises:
         ModelFileError: it is no model of ours; without the path.
     """
     if path.suffix == ".safetensors":
         return *_open_master(content), None
-    facts, session = _open_onnx(content)
-    return facts, None, session
+    facts, session_of = _open_onnx(content)
+    return facts, None, session_of
 
 
 def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
@@ -405,10 +407,19 @@ def _open_onnx(content: bytes) -> tuple[dict[str, Any], Any]:
     if [i.name for i in model.graph.input] != inputs or not {*OUTPUTS} <= {o.name for o in model.graph.output}:
         raise ModelFileError(f"its graph does not take {', '.join(inputs)} and give {', '.join(OUTPUTS)}" + TAKE_AGAIN)
     try:
-        return facts, open_onnx(content)
+        whole = open_onnx(content)
     except RUN_ERRORS as reason:
         raise_if_out_of_memory(reason)
         raise ModelFileError(f"ONNX Runtime does not take its graph ({said(reason)})" + TAKE_AGAIN) from None
+
+    @cache
+    def session_of(outputs: frozenset[str]) -> onnxruntime.InferenceSession:
+        # ONNX Runtime evaluates all of a graph, whatever is asked for.
+        if len(outputs) == len(OUTPUTS):
+            return whole
+        return open_onnx(Extractor(model).extract_model(inputs, sorted(outputs)).SerializeToString())
+
+    return facts, session_of
 
 
 def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensator:
