@@ -189,16 +189,15 @@ def fit_batched_sets(
     """
     index, _ = column_indices(begin[:, :1], width[:, :1])
     others, slot = column_indices(begin[:, 1:], width[:, 1:])
-    # -1, no column, stands for one of zeros: the last of a row, whichever that is.
-    square, of_y, size = turned.xx.numpy().ravel(), turned.xy.numpy(), len(turned.xx)
-    first, rest = index.numpy(), others.numpy()
-    parts = _Parts(
-        square.take(first * (size + 1)),
-        of_y.take(first),
-        square.take(first[:, :, None] * size + rest[:, None, :]),
-        square.take(rest[:, :, None] * size + rest[:, None, :]),
-        of_y.take(rest),
-        _members(slot, width.shape[1] - 1).numpy(),
+    # -1, no column, is the last one.
+    own = turned.xx[others[:, :, None], others[:, None, :]]
+    parts = _Parts.of(
+        turned.xx.diagonal()[index],
+        turned.xy[index],
+        turned.xx[index[:, :, None], others[:, None, :]],
+        own,
+        turned.xy[others],
+        _members(slot, width.shape[1] - 1),
     )
     return _most_probable(parts, width > 0, turned.yy, Prior(turned.values, noise_dof), updates, start)
 

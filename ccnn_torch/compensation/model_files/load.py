@@ -200,14 +200,12 @@ def kept(
     checked = {name: np.where(kept_rows[:, None], numbers[name], safe[name]) for name in floats}
     known = kept_rows & ~strange.any(-1)
     for way, (name, state) in flags_of.items():
-        at, flag = checked["command"] if way == "command" else given, flags[name]
-        if flag is None:
-            flag = np.zeros(rows, dtype=bool)
-        checked[name] = known & flag & promise.inside(np.concatenate([at, inputs[:, n:]], -1))
-        damped = known & (states[state] == DAMPED) if states[state] is not None else np.zeros(rows, dtype=bool)
-        of_row = np.where(damped, DAMPED, np.where(checked[name], EXACT, OUTSIDE))
-        lost = strange.any(-1) | (states[state] == NOT_FINITE if states[state] is not None else False)
-        checked[state] = np.where(lost, NOT_FINITE, of_row)
+        at = checked["command"] if way == "command" else given
+        # Of what is missing no row is kept.
+        flag, told = (np.zeros(rows) if v is None else v for v in (flags[name], states[state]))
+        checked[name] = known & (flag > 0) & promise.inside(np.concatenate([at, inputs[:, n:]], -1))
+        of_row = np.where(known & (told == DAMPED), DAMPED, np.where(checked[name], EXACT, OUTSIDE))
+        checked[state] = np.where(strange.any(-1) | (told == NOT_FINITE), NOT_FINITE, of_row)
     return checked | {"fallback": ~kept_rows}
 
 
@@ -426,7 +424,14 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
         check_signature(path, content, card_content, public_key)
     try:
         with code_refused("its metadata", allow_code):
-            facts, compensator, session_of = _opened(path, content)
+            if path.suffix == ".safetensors":
+                from ccnn_torch.compensation.model_files.master import open_master
+
+                facts, compensator = open_master(content)
+                runs: dict[str, Any] = {"make": lambda: compensator, "session_of": None}
+            else:
+                facts, session_of = open_export(content)
+                runs = {"make": None, "session_of": session_of}
     except InputError as reason:
         raise ModelFileError(f"{path}: {reason}") from None
     different = [key for key in facts if card.get(key) != facts[key]]
@@ -436,9 +441,7 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
             "belongs to another run: take both again from where they were written"
         )
     named: dict[str, Any] = {key: coordinates(facts[key]) for key in ("joints", "covariates", "pose")}
-    make = None if compensator is None else lambda: compensator
-    about: dict[str, Any] = {"make": make, "session_of": session_of, "machine": None, "signed": public_key is not None}
-    model = LoadedModel(path, card, facts, **named, **about)
+    model = LoadedModel(path, card, facts, **named, **runs, machine=None, signed=public_key is not None)
     n, centre = len(model.joints), model._promise.centre[None]
     try:
         model.run(centre[:, :n], centre[:, n:] if model.covariates else None)
@@ -446,20 +449,6 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
         raise_if_out_of_memory(reason)
         raise ModelFileError(f"{path}: cannot be run ({said(reason)})" + TAKE_AGAIN) from None
     return model
-
-
-def _opened(path: Path, content: bytes) -> tuple[dict[str, Any], Compensator | None, Any]:
-    """Facts, and the module, or what gives a session of ONNX Runtime for some of the outputs, by what the name ends in.
-
-    Raises:
-        ModelFileError: it is no model of ours; without the path.
-    """
-    if path.suffix == ".safetensors":
-        from ccnn_torch.compensation.model_files.master import open_master
-
-        return *open_master(content), None
-    facts, session_of = open_export(content)
-    return facts, None, session_of
 
 
 def load_compensation(
