@@ -135,7 +135,8 @@ def write_compensated(
                     f"--sd: {loaded.path} is identified geometry, which has no standard deviation of a command"
                 )
             added = _added(loaded, found, units, back, sd, shown)
-            added |= {} if poses is None else poses.commanded(found["command"])
+            if poses is not None:
+                added |= poses.commanded(found["command"])
             names = {header.partition("[")[0] for header in added}
             write({original.header(n): original.cells(n) for n in original.names if n not in names} | added)
             _count(result, table, found, back)

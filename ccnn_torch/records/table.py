@@ -242,10 +242,9 @@ def _cells(values: ArrayLike | list[str]) -> list[str]:
 def _numbers(values: NDArray[np.float64]) -> list[str]:
     """The text of each number; empty where it is none."""
     # Python's own formatting takes several times as long.
-    text = to_json(values.tolist(), inf_nan_mode="constants").decode()
-    for before, after in (("]", ","), ("NaN", ""), ("Infinity", "inf"), (".0,", ",")):
-        text = text.replace(before, after)
-    return text[1:].split(",")[:-1] if len(values) else []
+    text = to_json(values.tolist(), inf_nan_mode="constants").decode()[1:-1] + ","
+    text = text.replace("NaN", "").replace("Infinity", "inf").replace(".0,", ",")
+    return text.split(",")[:-1] if len(values) else []
 
 
 def _quoted(cell: str) -> str:
