@@ -34,7 +34,7 @@ from kinds import masked  # noqa: E402
 from benchmarks.command import session  # noqa: E402
 from benchmarks.measure import Row  # noqa: E402
 from ccnn_torch.compensation import Compensator, load_model  # noqa: E402
-from ccnn_torch.compensation.model_files.metadata import OUTPUTS  # noqa: E402
+from ccnn_torch.compensation.outputs import OUTPUTS  # noqa: E402
 from ccnn_torch.compensation.targets.c99 import print_c99  # noqa: E402
 from ccnn_torch.compensation.targets.export import COMMAND  # noqa: E402
 from ccnn_torch.compensation.targets.from_model import form_of  # noqa: E402

@@ -15,6 +15,7 @@ from ccnn_torch.compensation.effects import PhysicalEffects
 from ccnn_torch.compensation.expansions import ChebyshevExpansion
 from ccnn_torch.compensation.machine import Machine
 from ccnn_torch.compensation.networks import UncertainNetwork
+from ccnn_torch.compensation.outputs import WAYS
 from ccnn_torch.compensation.routines import KEPT, Functions, Learned, Variables, routines_of
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, OutsideDomainWarning
@@ -24,8 +25,6 @@ from ccnn_torch.training import Scaling
 TOLERANCE = 1e-12
 # A bound of 0 takes any correction to 0.
 _TINY = 1e-30
-# What can be asked for.
-WAYS = ("command", "back", "sd")
 
 Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
 

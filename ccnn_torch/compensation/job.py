@@ -6,200 +6,30 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
+from numpy.typing import ArrayLike
 
 from ccnn_torch.compensation.model_files.load import LoadedModel
-from ccnn_torch.compensation.routines import DAMPED
+from ccnn_torch.compensation.model_files.metadata import Array
+from ccnn_torch.compensation.outputs import DAMPED
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError
 from ccnn_torch.files.read import parse_json, read_text
-from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.mechanisms.branches import EXACT, ROUNDED, arrives, follow
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
-from ccnn_torch.numerics.rotations import homogeneous, matrix_to_rotation_vector, rotation_vector_to_matrix
-from ccnn_torch.records.commanded import commanded_poses, is_commanded
-from ccnn_torch.records.headers import columns_there, pose_columns, read_pose, stack_columns
+from ccnn_torch.records.commanded import is_commanded
+from ccnn_torch.records.headers import JOINT_LIMIT, columns_there, stack_columns
 from ccnn_torch.records.joint_map import JointMap, read_joint_map
-from ccnn_torch.records.load import JOINT_LIMIT
 from ccnn_torch.records.read_table import mapped, read_parts
 from ccnn_torch.records.table import Table, writing_table
-from ccnn_torch.units import from_si, si_unit_of
+from ccnn_torch.units import from_si
 
-# Joints all over the measured region, among which the first row's guess is looked for.
-_LOOKED_AT = 2000
+if TYPE_CHECKING:
+    from ccnn_torch.compensation.wanted import WantedPoses
+
 _LARGEST = 500_000_000
 ROWS = 4096
 """Rows that a model takes at once: its calls count for little then, and it takes a hundred MB."""
-
-
-Array: TypeAlias = NDArray[Any]
-
-
-class WantedPoses:
-    """Joints of tables of poses, one after the other; an arm goes on from the last row of the table before.
-
-    Attributes:
-        chooses: whether joints were found without a given branch, where there are several.
-        goals: whether poses are as the controller has them, `goal_x` …, not as they are measured.
-    """
-
-    def __init__(
-        self,
-        loaded: LoadedModel,
-        allow_code: bool = False,
-        tool: Sequence[float] | None = None,
-        base: Sequence[float] | None = None,
-        goals: bool = False,
-    ) -> None:
-        """Take the mechanism that the model was made for.
-
-        Args:
-            loaded: the model.
-            allow_code: run the Python file that the model names as its mechanism.
-            tool: of an arm, x, y, z and rotation vector of the tool's frame from the end of the last link [m, rad]; the
-                measured one when None.
-            base: of an arm, the same of the frame in which poses are given, in the measured one; that itself when None.
-
-        Raises:
-            InputError: `tool` or `base` of a machine that is no arm with orientation.
-        """
-        self._mechanism = loaded.mechanism(allow_code)
-        self._same = tool is None and base is None
-        machine = self._mechanism
-        if not (self._same or (isinstance(machine, SerialArm) and len(machine.pose) == 6)):
-            raise InputError(
-                f"{'--tool' if base is None else '--base'}: {loaded.path} was made for {machine.name}; only an arm "
-                "whose orientation was measured takes another tool or workpiece frame; leave it out"
-            )
-        self._before_pose = self._behind_pose = torch.eye(4, dtype=torch.float64)
-        if base is not None:
-            self._before_pose = frames_of(torch.tensor([*base], dtype=torch.float64))
-        if tool is not None:
-            measured = (machine if loaded.machine is None else loaded.machine.identified).nominal[-6:]
-            wanted = torch.tensor([*tool], dtype=torch.float64)
-            self._behind_pose = torch.linalg.inv(frames_of(wanted)) @ frames_of(measured)
-        self._first, self._region = torch.from_numpy(loaded.middle), torch.from_numpy(loaded.region)
-        self._before: Tensor | None = None
-        self.chooses, self.goals = False, goals
-        self._form: str | None = None
-        self._of_pose: dict[str, str] = {}
-
-    @property
-    def sentence(self) -> str:
-        """What to know where `chooses`."""
-        first, last = self._mechanism.joints[0], self._mechanism.joints[-1]
-        return (
-            "An arm reaches a pose on several branches (elbow, wrist): these are the joints nearest to those of the "
-            "previous row, in the first row to what was measured, and may be on another branch than intended; give "
-            f"guess_{first.header} to "
-            f"guess_{last.header} near the joints wanted."
-        )
-
-    def joints(self, table: Table, shown: JointMap | None = None) -> tuple[NDArray[np.float64], dict[str, str]]:
-        """Ideal joints of wanted poses, `rows x n` [SI], and the unit to write each in; guesses are as `shown`.
-
-        Raises:
-            InputError: a column is missing, or poses cannot be reached (named by line).
-        """
-        mechanism, within = self._mechanism, ROUNDED if self.goals else EXACT
-        if self.goals:
-            values, self._form, read = commanded_poses(table, mechanism)
-            mechanism = mechanism.controlled()
-            poses = torch.from_numpy(values)
-        else:
-            values, coordinates, self._form, read = read_pose(table, mechanism)
-            if len(coordinates) != len(mechanism.pose):
-                missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
-                raise InputError(
-                    f"{table.path}: the poses of {mechanism.name} need the columns {', '.join(missing)}, too"
-                )
-            poses = self._of_the_measured_tool(torch.from_numpy(values))
-        self._of_pose = _units(table, read)
-        guess = self._first
-        guesses = tuple(Coordinate(f"guess_{c.name}", c.unit) for c in mechanism.joints)
-        guided = any(c.name in table for c in guesses)
-        if guided:
-            near = stack_columns(table, guesses, JOINT_LIMIT)
-            guess = torch.from_numpy(near if shown is None else shown.of_shown(near))
-        self.chooses = bool(mechanism.orientations) and not guided
-        if self.chooses:
-            before = nearest_measured(mechanism, self._region, poses[0]) if self._before is None else self._before
-            joints = follow(mechanism, poses, before, within)
-            self._before = joints[-1]
-        else:
-            joints = mechanism.solve_inverse(poses, guess=guess)
-        # Of all full turns of a revolute joint the one nearest to the guess, or to the first one.
-        joints = nearest_turns(mechanism, joints, guess)
-        lost = np.flatnonzero(~arrives(mechanism, joints, poses, within).numpy())
-        if len(lost):
-            raise InputError(
-                f"{table.path}: no joints of {mechanism.name} were found for the pose at {table.name_rows(lost)}; "
-                f"correct or remove it, or give guess_q1[{mechanism.joints[0].unit}]… near the solution"
-            )
-        units = {g.name: table.units[g.name] for g in guesses} if guided else self._of_pose
-        keys = [g.name if guided else c.unit for g, c in zip(guesses, mechanism.joints, strict=True)]
-        return joints.detach().numpy(), {
-            c.name: units.get(key, c.unit) for c, key in zip(mechanism.joints, keys, strict=True)
-        }
-
-    def commanded(self, command: Array) -> dict[str, ArrayLike]:
-        """Columns of the poses to command where a controller takes no joints: the nominal ones of the commands.
-
-        In the machine's own base, of an arm at the tool of its file; in the form and units in which poses were wanted.
-        Empty where poses do not determine the joints.
-        """
-        machine = self._mechanism.controlled()
-        if len(machine.joints) > len(machine.pose):
-            return {}
-        pose = machine.forward_kinematics(torch.from_numpy(np.asarray(command))).numpy()
-        units = {c.name: c.unit for c in machine.pose}
-        columns = dict(zip(units, pose.T, strict=True))
-        if machine.orientations:
-            turns = pose_columns(pose, self._form)
-            columns = {name: columns[name] for name in ("x", "y", "z")} | turns
-            units |= dict.fromkeys(turns, "1" if self._form == "quaternion" else "rad")
-        shown = {name: self._of_pose.get(unit, unit) for name, unit in units.items()}
-        return {f"command_{n}[{shown[n]}]": from_si(values, units[n], shown[n]) for n, values in columns.items()}
-
-    def _of_the_measured_tool(self, poses: Tensor) -> Tensor:
-        """Poses of the tool and in the frame with which the model was made, `s x p`."""
-        if self._same:
-            return poses
-        found = self._before_pose @ frames_of(poses) @ self._behind_pose
-        return torch.cat([found[:, :3, 3], matrix_to_rotation_vector(found[:, :3, :3])], -1)
-
-
-def frames_of(poses: Tensor) -> Tensor:
-    """`... x 4 x 4` of x, y, z and rotation vectors `... x 6` [m, rad]."""
-    return homogeneous(rotation_vector_to_matrix(poses[..., 3:]), poses[..., :3])
-
-
-def _units(table: Table, read: Sequence[str]) -> dict[str, str]:
-    """SI unit -> the one unit in which the table has its pose columns of that kind."""
-    kinds: dict[str, set[str]] = {}
-    for unit in (table.units[name] for name in read):
-        kinds.setdefault(si_unit_of(unit), set()).add(unit)
-    return {kind: units.pop() for kind, units in kinds.items() if len(units) == 1}
-
-
-def nearest_measured(mechanism: Mechanism, region: Tensor, pose: Tensor) -> Tensor:
-    """Joints in the region, lowest and highest `n x 2`, whose pose is among the nearest to one, `n` [SI]."""
-    share = torch.rand(_LOOKED_AT, len(region), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    joints = region[:, 0] + (region[:, 1] - region[:, 0]) * share
-    error = mechanism.pose_error(mechanism.forward_kinematics(joints), pose)
-    turned = 0.0 if error.rotation is None else ROTATION_WEIGHT * error.rotation
-    return joints[torch.nan_to_num(error.position + turned, nan=torch.inf).argmin()]
-
-
-def nearest_turns(mechanism: Mechanism, joints: Tensor, guess: Tensor) -> Tensor:
-    """Joints `... x n` [SI] by so many full turns elsewhere that revolute ones are nearest to a guess."""
-    turning = torch.tensor([c.unit == "rad" for c in mechanism.joints])
-    return joints - torch.where(turning, 2 * torch.pi * torch.round((joints - guess) / (2 * torch.pi)), 0.0)
 
 
 @dataclass
@@ -255,7 +85,11 @@ def compensate_table(
     Raises:
         InputError: a file cannot be read or is not in this form; nothing is written then.
     """
-    poses = WantedPoses(loaded, allow_code, tool, base) if pose else None
+    poses = None
+    if pose:
+        from ccnn_torch.compensation.wanted import WantedPoses
+
+        poses = WantedPoses(loaded, allow_code, tool, base)
     found = write_compensated(loaded, input, output, poses, back, sd, allow_code=allow_code)
     said = sentences(output, found, loaded)
     refused = (
@@ -284,6 +118,8 @@ def write_compensated(
             # Headers that the model's run mapped are mapped alike; OUT repeats them as they are.
             table = mapped(original, columns_there(original.units, loaded.columns))
             if poses is None and not back and is_commanded(table, loaded.joints):
+                from ccnn_torch.compensation.wanted import WantedPoses
+
                 poses = WantedPoses(loaded, allow_code, goals=True)
             # A file of poses or commands alone is of the controller as well; one with the mechanism's joints is not.
             own = poses is None and all(c.name in original for c in loaded.joints)
@@ -299,7 +135,8 @@ def write_compensated(
                     f"--sd: {loaded.path} is identified geometry, which has no standard deviation of a command"
                 )
             added = _added(loaded, found, units, back, sd, shown)
-            added |= {} if poses is None else poses.commanded(found["command"])
+            if poses is not None:
+                added |= poses.commanded(found["command"])
             names = {header.partition("[")[0] for header in added}
             write({original.header(n): original.cells(n) for n in original.names if n not in names} | added)
             _count(result, table, found, back)

@@ -17,13 +17,10 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.compensation.machine import ASTRAY, SETTLED
+from ccnn_torch.compensation.outputs import DAMPED, EXACT, NOT_FINITE, OUTSIDE
 
 if TYPE_CHECKING:
     from ccnn_torch.compensation.compensator import Compensator
-
-EXACT, OUTSIDE, NOT_FINITE, DAMPED = range(4)
-"""Status of a command: exact; outside what was measured; an input is not finite, and the command is the joints; damped
-near a singular pose, at a limit or not settled, and the command is the nearest safe one."""
 
 # Steps of Broyden's method below it are rounding, from which nothing is learned: share of the limit.
 _ROUNDING = 1e-10

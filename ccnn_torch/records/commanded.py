@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Generator, Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.headers import HasCoordinates, check_joints, read_pose, stack_columns
 from ccnn_torch.records.joint_map import read_joint_map, with_joints
 from ccnn_torch.records.table import Table
+
+if TYPE_CHECKING:
+    from torch import Generator, Tensor
 
 GOAL = "goal_"
 """Prefix of the columns of a commanded pose."""
@@ -86,6 +87,8 @@ def commanded_poses(
     Raises:
         InputError: a column is missing or cannot be used, or they do not determine the joints.
     """
+    import torch
+
     machine, named = mechanism.controlled(), f"{GOAL}{{}}{ending}"
     samples = machine.sample_workspace(_SAMPLES, torch.Generator().manual_seed(0))
     still = [
@@ -113,6 +116,8 @@ def _with_columns(table: Table, coordinates: Sequence[Coordinate], values: NDArr
 
 def _with_commanded(table: Table, mechanism: Moving, ending: str = "") -> Table:
     """The table with the joints of the commanded poses, and a note on them."""
+    import torch
+
     machine = mechanism.controlled()
     poses, _, read = commanded_poses(table, mechanism, ending)
     guesses = [Coordinate(f"guess_{joint.name}{ending}", joint.unit) for joint in machine.joints]

@@ -19,6 +19,8 @@ from ccnn_torch.units import si_unit_of, split_header, to_si
 
 # Characters of a name.
 _LONGEST = 100
+# Two turns of a joint, rounded up as the limit of a pose angle is.
+JOINT_LIMIT = 12.6
 IGNORE = "ignore"
 """The entry in a map of columns for a column to leave out."""
 

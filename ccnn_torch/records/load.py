@@ -17,6 +17,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.records.commanded import Moving, is_open, read_joints
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES, choose_covariates
 from ccnn_torch.records.headers import (
+    JOINT_LIMIT,
     HasCoordinates,
     check_orientation,
     read_pose as read_pose,
@@ -106,8 +107,6 @@ def _check_alike(first: Table, other: Table) -> None:
             )
 
 
-# Two turns of a joint, rounded up as the limit of a pose angle is.
-JOINT_LIMIT = 12.6
 # A joint is beyond its limits by more than rounding [rad or m]; in more than this share of the rows that is said, as
 # are directions of 0.
 _AT_LIMIT, _MANY = 1e-6, 0.1

@@ -17,6 +17,7 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
@@ -94,6 +95,8 @@ _MOST_PACKED = 100
 _WORKBOOKS = (".xlsx", ".xlsm")
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 _DOT_NUMBER = re.compile(r"[+-]?\d*\.\d*([eE][+-]?\d+)?")
+# Cells that are numbers of JSON, as nearly all are: its parser takes a quarter of the time of NumPy's.
+_NUMBERS = TypeAdapter(list[float])
 # A row of a spreadsheet.
 _Cells = Sequence[object]
 _Row = TypeVar("_Row")
@@ -167,12 +170,14 @@ def _csv_parts(file: str, rows: int | None, columns: Mapping[str, str] | None) -
         lines_of_text: list[str], lines: NDArray[np.int64], start: int
     ) -> tuple[NDArray[np.float64], dict[tuple[int, int], str]]:
         plain = [row.replace(",", ".") for row in lines_of_text] if comma else lines_of_text
-        try:
-            values = np.loadtxt(plain, delimiter=separator, comments=None, quotechar='"', ndmin=2)
-            if values.shape == (len(plain), header.width):
-                return values, {}
-        except ValueError:
-            pass
+        if {row.count(separator) for row in plain} == {header.width - 1}:
+            # -0 would be an integer, without its sign.
+            cells = (",".join(plain).replace(separator, ",") + ",").replace("-0,", "-0.0,")
+            try:
+                values = np.array(_NUMBERS.validate_json(f"[{cells[:-1]}]", strict=True))
+                return values.reshape(len(plain), header.width), {}
+            except ValueError:
+                pass
         return _read_cells(_split(lines_of_text, separator, file, lines), header, file, lines, separator, comma, start)
 
     yield from _parts(file, header, chain(head[1:], filled), numbers, rows, text.notes)

@@ -22,7 +22,7 @@ from safetensors.torch import load_file, save_file
 from stand_ins import fields, tripod_joints
 
 from ccnn_torch.compensation import load_model, save_model
-from ccnn_torch.compensation.model_files.metadata import _digest, to_json
+from ccnn_torch.compensation.model_files.metadata import digest_of, to_json
 from ccnn_torch.errors import FallbackWarning, ModelFileError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
@@ -53,7 +53,7 @@ def vouch(path: Path, facts: dict[str, Any]) -> None:
 def stamped(facts: dict[str, Any], **changed: Any) -> dict[str, Any]:
     """Facts with other values and a hash that fits them."""
     facts = json.loads(json.dumps(facts | changed))
-    facts["sha256"]["keys"] = _digest(facts)
+    facts["sha256"]["keys"] = digest_of(facts)
     return facts
 
 

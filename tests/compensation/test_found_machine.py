@@ -13,8 +13,9 @@ from fitted import LIMITS, six_axis_arm
 
 from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.compensation import load_compensation
-from ccnn_torch.compensation.job import WantedPoses, compensate_table
+from ccnn_torch.compensation.job import compensate_table
 from ccnn_torch.compensation.model_files.identified import model_of_machine
+from ccnn_torch.compensation.wanted import WantedPoses
 from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
 from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError

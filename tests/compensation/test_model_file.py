@@ -379,7 +379,7 @@ def test_memory_that_runs_out_while_a_model_is_read_is_no_fault_of_it(
     def full(*_: object) -> None:
         raise RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory")
 
-    for name, where in (("model.safetensors", "_rebuild"), ("model.onnx", "open_onnx")):
+    for name, where in (("model.safetensors", "master._rebuild"), ("model.onnx", "metadata.open_onnx")):
         with monkeypatch.context() as patched, pytest.raises(MemoryError):
-            patched.setattr(f"ccnn_torch.compensation.model_files.metadata.{where}", full)
+            patched.setattr(f"ccnn_torch.compensation.model_files.{where}", full)
             load_model(copied / name)

@@ -18,8 +18,9 @@ from stand_ins import Sigmoids, fields, tripod_joints
 from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, LoadedModel, load_compensation, register_network, save_model
-from ccnn_torch.compensation.job import WantedPoses, sentences, write_compensated
+from ccnn_torch.compensation.job import sentences, write_compensated
 from ccnn_torch.compensation.model_files.identified import load_geometry
+from ccnn_torch.compensation.wanted import WantedPoses
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.mechanisms.mechanism_file import write_machine

@@ -7,31 +7,32 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 
-from ccnn_torch.compensation.compensator import WAYS, Compensator
-from ccnn_torch.compensation.machine import FARTHEST
 from ccnn_torch.compensation.model_files.metadata import (
     RUN_ERRORS,
     TAKE_AGAIN,
     Array,
     card_of,
     coordinates,
-    description_of,
-    open_model,
+    open_export,
     run_onnx,
     said,
 )
 from ccnn_torch.compensation.model_files.signature import check_signature
+from ccnn_torch.compensation.outputs import DAMPED, EXACT, FLAGS, NOT_FINITE, NUMBERS, OUTSIDE, WAYS
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError, raise_if_out_of_memory
-from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.plugins import code_refused
+
+# An export runs without torch, whose import takes longer than all else.
+if TYPE_CHECKING:
+    from ccnn_torch.compensation.compensator import Compensator
+    from ccnn_torch.effects.found_machine import FoundMachine
+    from ccnn_torch.mechanisms import Mechanism
 
 MODEL_FORMS, MACHINE_FORMS = (".safetensors", ".onnx"), (".yaml", ".yml", ".json")
 # From here an input counts as infinite; as in a `Domain`, but for the joints of a machine.
@@ -85,6 +86,8 @@ class Promise:
         )
         huge = np.full(len(centre), _HUGE)
         if "machine" in facts:
+            from ccnn_torch.compensation.machine import FARTHEST
+
             huge[: len(limits)] = FARTHEST
         return cls(
             limit,
@@ -177,8 +180,8 @@ def kept(
 
     safe = {"command": given, "deviation": np.zeros_like(given), "ideal": given}
     safe["deviation_sd"] = np.broadcast_to(promise.sd, given.shape)
-    floats = [name for way in ways for name in _NUMBERS[way]]
-    flags_of = {way: names for way, names in _FLAGS.items() if way in ways}
+    floats = [name for way in ways for name in NUMBERS[way]]
+    flags_of = {way: names for way, names in FLAGS.items() if way in ways}
     # Where an output is no such numbers there are none.
     there = {name: _of_kind(found.get(name), (rows, n), np.float64) for name in floats}
     flags = {name: _of_kind(found.get(name), (rows,), np.bool_) for name, _ in flags_of.values()}
@@ -197,20 +200,13 @@ def kept(
     checked = {name: np.where(kept_rows[:, None], numbers[name], safe[name]) for name in floats}
     known = kept_rows & ~strange.any(-1)
     for way, (name, state) in flags_of.items():
-        at, flag = checked["command"] if way == "command" else given, flags[name]
-        if flag is None:
-            flag = np.zeros(rows, dtype=bool)
-        checked[name] = known & flag & promise.inside(np.concatenate([at, inputs[:, n:]], -1))
-        damped = known & (states[state] == 3) if states[state] is not None else np.zeros(rows, dtype=bool)
-        of_row = np.where(damped, 3, np.where(checked[name], 0, 1))
-        lost = strange.any(-1) | (states[state] == 2 if states[state] is not None else False)
-        checked[state] = np.where(lost, 2, of_row)
+        at = checked["command"] if way == "command" else given
+        # Of what is missing no row is kept.
+        flag, told = (np.zeros(rows) if v is None else v for v in (flags[name], states[state]))
+        checked[name] = known & (flag > 0) & promise.inside(np.concatenate([at, inputs[:, n:]], -1))
+        of_row = np.where(known & (told == DAMPED), DAMPED, np.where(checked[name], EXACT, OUTSIDE))
+        checked[state] = np.where(strange.any(-1) | (told == NOT_FINITE), NOT_FINITE, of_row)
     return checked | {"fallback": ~kept_rows}
-
-
-# Outputs of each way.
-_NUMBERS = {"command": ("command", "deviation"), "back": ("ideal",), "sd": ("deviation_sd",)}
-_FLAGS = {"command": ("inside_domain", "status"), "back": ("ideal_inside_domain", "ideal_status")}
 
 
 def _of_kind(value: Any, shape: tuple[int, ...], kind: type) -> Array | None:
@@ -232,7 +228,7 @@ class LoadedModel:
         facts: the file's metadata, equal to the card where both have a key; of a machine the nominal one's `mechanism`.
         joints, covariates, pose: coordinates in order; geometry alone has no covariates.
         make: gives the compensator, where the file is no export.
-        session: of ONNX Runtime, where it is one.
+        session_of: gives a session of ONNX Runtime for some of the outputs, where it is one.
         machine: as an identification found it; None for a model that has learned.
         signed: whether a signature was asked for: then what no signature covers is not believed.
     """
@@ -244,7 +240,7 @@ class LoadedModel:
     covariates: tuple[Coordinate, ...]
     pose: tuple[Coordinate, ...]
     make: Callable[[], Compensator] | None
-    session: Any
+    session_of: Callable[[frozenset[str]], Any] | None
     machine: FoundMachine | None
     signed: bool
 
@@ -295,8 +291,12 @@ class LoadedModel:
 
     def run(self, joints: Array, covariates: Array | None, ways: Collection[str] = WAYS) -> dict[str, Array]:
         """What the file itself gives for joints `s x n` and covariates `s x m`; raises what it likes."""
-        if self.compensator is None:
-            return run_onnx(self.session, joints, covariates)
+        if self.session_of is not None:
+            outputs = frozenset(name for way in ways for name in (*NUMBERS[way], *FLAGS.get(way, ())))
+            return run_onnx(self.session_of(outputs), joints, covariates)
+        import torch
+
+        assert self.compensator is not None
         beside = None if covariates is None else torch.tensor(covariates)
         with torch.no_grad():
             found = self.compensator.run(torch.tensor(joints), beside, ways)
@@ -313,8 +313,12 @@ class LoadedModel:
 
     @cached_property
     def _promise(self) -> Promise:
-        compensator = None if self.machine is None else self.compensator
-        return Promise.of_card(self.facts if compensator is None else description_of(compensator))
+        if self.machine is None:
+            return Promise.of_card(self.facts)
+        from ccnn_torch.compensation.model_files.master import description_of
+
+        assert self.compensator is not None
+        return Promise.of_card(description_of(self.compensator))
 
     @property
     def columns(self) -> dict[str, str]:
@@ -335,6 +339,8 @@ class LoadedModel:
             return np.array([[edge["low"], edge["high"]] for edge in edges])
         measured = self.machine.joints
         if not len(measured):
+            import torch
+
             from ccnn_torch.compensation.fit import all_over
 
             joints = all_over(self.machine.nominal).joints
@@ -359,6 +365,8 @@ class LoadedModel:
         Raises:
             InputError: it is a user's own and `allow_code` is not given, or its file is missing.
         """
+        from ccnn_torch.mechanisms import mechanism_from_description
+
         with code_refused(f"{self.path}: its mechanism", allow_code):
             return mechanism_from_description(self.facts["mechanism"], allow_code=True)
 
@@ -368,7 +376,7 @@ class LoadedModel:
             return self.machine.identified
         mechanism = self.mechanism(allow_code)
         values = self.facts.get("machine", {}).get("identified")
-        return mechanism if values is None else mechanism.with_nominal(torch.tensor(values, dtype=torch.float64))
+        return mechanism if values is None else mechanism.with_nominal(mechanism.nominal.new_tensor(values))
 
 
 def read_model(path: Path) -> bytes:
@@ -416,7 +424,14 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
         check_signature(path, content, card_content, public_key)
     try:
         with code_refused("its metadata", allow_code):
-            facts, compensator, session = open_model(path, content)
+            if path.suffix == ".safetensors":
+                from ccnn_torch.compensation.model_files.master import open_master
+
+                facts, compensator = open_master(content)
+                runs: dict[str, Any] = {"make": lambda: compensator, "session_of": None}
+            else:
+                facts, session_of = open_export(content)
+                runs = {"make": None, "session_of": session_of}
     except InputError as reason:
         raise ModelFileError(f"{path}: {reason}") from None
     different = [key for key in facts if card.get(key) != facts[key]]
@@ -426,9 +441,7 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
             "belongs to another run: take both again from where they were written"
         )
     named: dict[str, Any] = {key: coordinates(facts[key]) for key in ("joints", "covariates", "pose")}
-    make = None if compensator is None else lambda: compensator
-    about: dict[str, Any] = {"make": make, "session": session, "machine": None, "signed": public_key is not None}
-    model = LoadedModel(path, card, facts, **named, **about)
+    model = LoadedModel(path, card, facts, **named, **runs, machine=None, signed=public_key is not None)
     n, centre = len(model.joints), model._promise.centre[None]
     try:
         model.run(centre[:, :n], centre[:, n:] if model.covariates else None)

@@ -1,12 +1,11 @@
-"""What a model file says of itself, the same in the master and every export, and a way to run it without its code."""
+"""What a model file says of itself, the same in the master and every export, and exports that run without its code."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import platform
 from collections.abc import Iterator, Mapping
-from importlib.metadata import version
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,19 +13,13 @@ import onnx
 import onnxruntime
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
+from onnx.utils import Extractor
 from onnxruntime.capi import onnxruntime_pybind11_state as runtime
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from torch import Tensor
 
-from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.domain import Domain
-from ccnn_torch.compensation.networks import describe_network, network_from_description
+from ccnn_torch.compensation.outputs import OUTPUTS
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError, raise_if_out_of_memory
-from ccnn_torch.training import Scaling, tensor_digest
-from ccnn_torch.version import __version__
 
 Array = NDArray[Any]
 
@@ -34,10 +27,6 @@ Array = NDArray[Any]
 TAKE_AGAIN = "; take it again from where it was written"
 
 METADATA_KEY = "ccnn_torch"
-OUTPUTS = (
-    *("command", "deviation", "inside_domain", "ideal", "ideal_inside_domain", "deviation_sd"),
-    *("status", "ideal_status"),
-)
 
 # What a graph or a module of another kind than ours may raise. ONNX Runtime's errors have no common class.
 RUN_ERRORS: tuple[type[Exception], ...] = (
@@ -45,10 +34,6 @@ RUN_ERRORS: tuple[type[Exception], ...] = (
     *(v for v in vars(runtime).values() if isinstance(v, type) and issubclass(v, Exception)),
 )
 _FORMATS = "ccnn_torch compensator "
-OPTIONAL = ("secant", "geometry", "effects", "machine")
-"""Keys of parts that not every model has."""
-_REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
-_PACKAGES = ("torch", "onnx", "onnxruntime", "safetensors", "numpy")
 # No model that can be solved for needs as many; a forged one may not compute for ever.
 _MOST_ITERATIONS = 10_000
 _MOST_TERMS = 100
@@ -218,51 +203,6 @@ class Card(Facts):
     notes: list[str]
 
 
-def fingerprint(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything a reader of the model needs beside its tensors; equal for equal model and fields.
-
-    Args:
-        fields: `mechanism` (its `describe()`), `metrics`, `data_sha256`, `seed`.
-    """
-    missing = [key for key in _REQUIRED if key not in fields]
-    if missing:
-        raise InputError(f"a model's fields lack {', '.join(missing)}; needed are {', '.join(_REQUIRED)}")
-    mechanism = fields["mechanism"]
-    pose = mechanism.get("pose", []) if isinstance(mechanism, Mapping) else []
-    facts: dict[str, Any] = {
-        "format": FORMAT,
-        **{key: fields[key] for key in _REQUIRED},
-        "pose": [dict(zip(("name", "unit"), header.rstrip("]").split("["), strict=True)) for header in pose],
-        "versions": {"python": platform.python_version(), "ccnn_torch": __version__}
-        | {name: version(name) for name in _PACKAGES},
-        **description_of(compensator),
-    }
-    facts["sha256"] = {"tensors": tensor_digest(dict(compensator.state_dict()))}
-    facts["sha256"]["keys"] = _digest(facts)
-    return facts
-
-
-def description_of(compensator: Compensator) -> dict[str, Any]:
-    """What the metadata says of the compensator itself."""
-    about = (compensator.limit, compensator.most, compensator.safe, compensator.safe_sd, compensator.sd_scale)
-    limits = (v.tolist() for v in about)
-    parts = {name: getattr(compensator, name) for name in OPTIONAL[1:]}
-    return {
-        "joints": [{"name": c.name, "unit": c.unit} for c in compensator.joints],
-        "covariates": [{"name": c.name, "unit": c.unit} for c in compensator.covariates],
-        "network": describe_network(compensator.network),
-        "domain": compensator.domain.describe(compensator.joints + compensator.covariates),
-        "limits": {
-            c.name: {"unit": c.unit, **dict(zip(Limit.model_fields, values, strict=True))}
-            for c, *values in zip(compensator.joints, *limits, strict=True)
-        },
-        "lipschitz": compensator.lipschitz,
-        "iterations": compensator.iterations,
-        **({"secant": True} if compensator.secant else {}),
-        **{name: part.describe() for name, part in parts.items() if part is not None},
-    }
-
-
 def read_facts(text: Any) -> dict[str, Any]:
     """The facts in a file's metadata, when they are ours, unchanged, and of the form that is used later.
 
@@ -284,7 +224,7 @@ def read_facts(text: Any) -> dict[str, Any]:
             f"its metadata does not have the form '{FORMAT}', so this package did not write it" + TAKE_AGAIN
         )
     stated = facts.get("sha256")
-    if not isinstance(stated, dict) or stated.get("keys") != _digest(facts):
+    if not isinstance(stated, dict) or stated.get("keys") != digest_of(facts):
         raise ModelFileError("its metadata was edited after it was written" + TAKE_AGAIN)
     # Two texts can mean one number (long decimals do), so the text itself must be the one we would write.
     if to_json(facts) != text:
@@ -310,12 +250,6 @@ def read_facts(text: Any) -> dict[str, Any]:
         if not good:
             raise ModelFileError(f"its card or text has '{key}' wrong (it does not fit the joints)" + TAKE_AGAIN)
     return facts
-
-
-def check_tensors(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
-    """Raise ModelFileError unless the tensors are those that the facts were written with."""
-    if facts["sha256"]["tensors"] != tensor_digest(tensors):
-        raise ModelFileError("its weights were altered after it was written" + TAKE_AGAIN)
 
 
 def coordinates(entries: list[dict[str, str]]) -> tuple[Coordinate, ...]:
@@ -349,47 +283,13 @@ def from_json(text: str | bytes) -> Any:
         raise ValueError("is nested too deeply") from None
 
 
-def _digest(facts: Mapping[str, Any]) -> str:
+def digest_of(facts: Mapping[str, Any]) -> str:
     """SHA-256 of everything but itself; that of the tensors is among it."""
     others = {key: value for key, value in facts["sha256"].items() if key != "keys"}
     return hashlib.sha256(to_json({**facts, "sha256": others}).encode()).hexdigest()
 
 
-def open_model(path: Path, content: bytes) -> tuple[dict[str, Any], Compensator | None, Any]:
-    """Facts, and the module or a session of ONNX Runtime, by what the name ends in.
-
-    Raises:
-        ModelFileError: it is no model of ours; without the path.
-    """
-    if path.suffix == ".safetensors":
-        return *_open_master(content), None
-    facts, session = _open_onnx(content)
-    return facts, None, session
-
-
-def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
-    try:
-        tensors = load_tensors(content)
-        # The header's length is in the first eight bytes, the header behind it; load() keeps it to itself.
-        header = from_json(content[8 : 8 + int.from_bytes(content[:8], "little")])
-    except (SafetensorError, ValueError, KeyError):
-        raise ModelFileError("it is damaged, or no safetensors file" + TAKE_AGAIN) from None
-    facts = read_facts(header.get("__metadata__", {}).get(METADATA_KEY))
-    try:
-        check_tensors(facts, tensors)
-        compensator = _rebuild(facts, tensors)
-        limits = [compensator.limit.tolist(), compensator.most.tolist()]
-    except RUN_ERRORS as reason:
-        raise_if_out_of_memory(reason)
-        raise ModelFileError(
-            f"its tensors are not those that its metadata lists ({said(reason)})" + TAKE_AGAIN
-        ) from None
-    if limits != [[facts["limits"][c["name"]][k] for c in facts["joints"]] for k in ("limit", "most_deviation")]:
-        raise ModelFileError("its limits are not those of its metadata" + TAKE_AGAIN)
-    return facts, compensator
-
-
-def _open_onnx(content: bytes) -> tuple[dict[str, Any], Any]:
+def open_export(content: bytes) -> tuple[dict[str, Any], Any]:
     try:
         model = onnx.load_from_string(content)
     except DecodeError:
@@ -405,44 +305,19 @@ def _open_onnx(content: bytes) -> tuple[dict[str, Any], Any]:
     if [i.name for i in model.graph.input] != inputs or not {*OUTPUTS} <= {o.name for o in model.graph.output}:
         raise ModelFileError(f"its graph does not take {', '.join(inputs)} and give {', '.join(OUTPUTS)}" + TAKE_AGAIN)
     try:
-        return facts, open_onnx(content)
+        whole = open_onnx(content)
     except RUN_ERRORS as reason:
         raise_if_out_of_memory(reason)
         raise ModelFileError(f"ONNX Runtime does not take its graph ({said(reason)})" + TAKE_AGAIN) from None
 
+    @cache
+    def session_of(outputs: frozenset[str]) -> onnxruntime.InferenceSession:
+        # ONNX Runtime evaluates all of a graph, whatever is asked for.
+        if len(outputs) == len(OUTPUTS):
+            return whole
+        return open_onnx(Extractor(model).extract_model(inputs, sorted(outputs)).SerializeToString())
 
-def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensator:
-    """The module out of its description and tensors."""
-    parts: dict[str, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        part, _, rest = name.partition(".")
-        parts.setdefault(part, {})[rest] = value
-
-    def made(key: str) -> Any:
-        if key not in facts:
-            return None
-        module = network_from_description(facts[key])
-        module.load_state_dict(parts.get(key, {}))
-        return module
-
-    return Compensator(
-        made("network").requires_grad_(False),
-        Scaling(**parts["scaling"]),
-        Domain(**parts["domain"]),
-        tensors["limit"],
-        tensors["safe"],
-        coordinates(facts["joints"]),
-        coordinates(facts["covariates"]),
-        facts["lipschitz"],
-        facts["iterations"],
-        tensors["sd_scale"],
-        tensors["safe_sd"],
-        made("geometry"),
-        made("effects"),
-        facts.get("secant", False),
-        made("machine"),
-        tensors["most"],
-    )
+    return facts, session_of
 
 
 def card_of(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:

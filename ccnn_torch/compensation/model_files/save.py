@@ -11,7 +11,8 @@ from typing import Any
 from safetensors.torch import save
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, OPTIONAL, fingerprint, to_json
+from ccnn_torch.compensation.model_files.master import OPTIONAL, fingerprint
+from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, to_json
 from ccnn_torch.compensation.targets.onnx_export import export_float32, export_onnx
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.files.write import write_whole

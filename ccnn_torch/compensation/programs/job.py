@@ -10,12 +10,13 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from ccnn_torch.compensation.job import ROWS, frames_of, nearest_measured, nearest_turns
+from ccnn_torch.compensation.job import ROWS
 from ccnn_torch.compensation.model_files.load import LoadedModel
+from ccnn_torch.compensation.outputs import DAMPED
 from ccnn_torch.compensation.programs import G_CODE
 from ccnn_torch.compensation.programs.gcode import GCode
 from ccnn_torch.compensation.programs.literals import Array, Krl, Point, Rapid
-from ccnn_torch.compensation.routines import DAMPED
+from ccnn_torch.compensation.wanted import frames_of, nearest_measured, nearest_turns
 from ccnn_torch.display import plain
 from ccnn_torch.errors import FallbackWarning, InputError
 from ccnn_torch.files.read import read_bytes

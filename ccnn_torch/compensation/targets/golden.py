@@ -12,7 +12,8 @@ from torch import Tensor
 
 from ccnn_torch.compensation.compensator import TOLERANCE, Compensator
 from ccnn_torch.compensation.fit import SINGLE_TOLERANCE
-from ccnn_torch.compensation.routines import DAMPED, execute
+from ccnn_torch.compensation.outputs import DAMPED
+from ccnn_torch.compensation.routines import execute
 from ccnn_torch.compensation.targets.form import OPERATIONS, Array, Expression, Form, Leaf, Let, Program
 from ccnn_torch.errors import MethodFailedError
 

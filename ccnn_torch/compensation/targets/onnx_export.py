@@ -22,7 +22,8 @@ from torch.fx import GraphModule
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.fit import SINGLE_TOLERANCE, single_steps
-from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, OUTPUTS, check_graph, open_onnx, run_onnx
+from ccnn_torch.compensation.model_files.metadata import METADATA_KEY, check_graph, open_onnx, run_onnx
+from ccnn_torch.compensation.outputs import OUTPUTS
 from ccnn_torch.compensation.routines import (
     KEPT,
     Functions,

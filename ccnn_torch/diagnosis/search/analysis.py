@@ -307,23 +307,26 @@ def _with_shared_noise(state: Analysis) -> Analysis:
         # Rows that lack values have no noise in them that they could share.
         return state
     atoms, white, keep = state.atoms, state.whitening, state.whitening.keep()
-    sets = [(), state.best_of_library.members, state.found[0].members]
+    sets = {(), state.best_of_library.members, state.found[0].members}
     members = sorted({i for s in sets for i in s})
     columns = [state.residual[..., None], *(atoms[i].columns for i in members)]
     places = dict(zip(members, groups_of(columns[1:]), strict=True))
     possible, grams, scores = possible_correlations(state.situation, keep), [], []
     for correlation in possible:
         flat = torch.cat(_whitened(white, state.fitted, correlation, columns), -1).flatten(0, 1)
-        grams += [flat.mT @ flat] * len(sets)
+        grams.append(flat.mT @ flat)
         score = correlation.log_determinant(*state.dictionary.y.shape) + (LOG_PRIOR if correlation.value else 0.0)
         # What any size of the frames is as probable for.
         scores.append(score - size_of_fitted(correlation(white(state.fitted)[keep])))
-    # Every set under every correlation, side by side.
+    # A set under every correlation, side by side.
     every = torch.stack(grams)
     known = Grams(every[:, 1:, 1:], every[:, 1:, 0], every[:, 0, 0], white.count())
-    fits = fit_sets(known, [[places[i] for i in s] for s in sets] * len(possible), state.dictionary.noise_dof)
-    log_prior = fits.log_evidence.new_tensor([sum(atoms[i].log_prior for i in s) for s in sets])
-    likely = (fits.log_evidence.reshape(-1, len(sets)) + log_prior).amax(-1)
+    each = [
+        fit_sets(known, [[places[i] for i in s]] * len(possible), state.dictionary.noise_dof).log_evidence
+        + sum(atoms[i].log_prior for i in s)
+        for s in sets
+    ]
+    likely = torch.stack(each).amax(0)
     correlation = possible[int((likely + likely.new_tensor(scores)).argmax())]
     if not correlation.value:
         return state
