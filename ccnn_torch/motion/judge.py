@@ -21,7 +21,6 @@ from torch import Tensor
 from ccnn_torch.evidence.form_error import DIRECTIONS, LEVELS, LOG_EXACT, OF_SMOOTH, share_of_exact
 from ccnn_torch.evidence.judge import Explanation, judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import Grams
-from ccnn_torch.motion.drivers import Driver, driver_columns
 from ccnn_torch.motion.fit import side_by_side, weighed
 from ccnn_torch.motion.outside import NEARLY, Candidate, Members, essential, holds, with_drivers
 from ccnn_torch.motion.problem import Problem
@@ -60,9 +59,8 @@ class AxisVerdict(NamedTuple):
 
 def judge_axes(found: Search) -> list[AxisVerdict]:
     """The verdict on each axis."""
-    best = [fits[0].spec for fits in found.found]
-    drivers, above = driver_columns(found.problem, best), _above_white(found.problem, best)
-    verdicts = [_judged(found, i, drivers, above[i]) for i in range(len(found.found))]
+    above = _above_white(found.problem, [fits[0].spec for fits in found.found])
+    verdicts = [_judged(found, i, above[i]) for i in range(len(found.found))]
     named = {m for v in verdicts for m in v.best.members}
     # What another joint shows clearly is not hidden.
     verdicts = [v._replace(hidden=None, doubted=False) if v.hidden in named else v for v in verdicts]
@@ -116,13 +114,13 @@ def _above_white(problem: Problem, specs: Sequence[Spec]) -> list[float]:
     return ratio
 
 
-def _judged(search: Search, axis: int, drivers: Sequence[Driver], above: float) -> AxisVerdict:
+def _judged(search: Search, axis: int, above: float) -> AxisVerdict:
     problem, fits = search.problem, search.found[axis]
     by_members = {f.members: f for f in fits}
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
     sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f.spec)) for f in fits]
-    sets += with_drivers(search, axis, drivers, by_members)
+    sets += with_drivers(search, axis, by_members)
     twins, beside, noise = problem.library.twins, search.nuisance.shape[1], fits[0].noise
 
     def named(level: float) -> list[Named]:

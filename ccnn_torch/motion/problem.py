@@ -95,10 +95,10 @@ class Problem:
         """Numbers of the nominal model of every axis, `n x k`."""
         return torch.zeros(len(self.unit), self.library.size, dtype=torch.float64)
 
-    def under(self, torque: Tensor, axis: int, size: Tensor) -> Problem:
-        """The same with a torque that resists an axis' motor, the sum of `torque`, `n x m x b x s`, times `size`."""
+    def under(self, axis: int, torque: Tensor) -> Problem:
+        """The same with a torque that resists the motor of an axis, over the gain, `b x s` [rad or m]."""
         push = torch.zeros_like(self.driven.followed) if self.driven.torque is None else self.driven.torque.clone()
-        push[axis] += torch.tensordot(size, torque[axis], 1)
+        push[axis] += torque
         return replace(self, data=self.data.under(push), driven=self.driven._replace(torque=push))
 
     def pushed(self, theta: Tensor, axis: Tensor, torque: Tensor) -> Tensor:
