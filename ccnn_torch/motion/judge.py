@@ -120,7 +120,9 @@ def _judged(search: Search, axis: int, above: float) -> AxisVerdict:
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
     sets = [Candidate(essential(f.members, left, unseen), (), f.grams, f.spec.groups, prior_of(f.spec)) for f in fits]
-    sets += with_drivers(search, axis, by_members)
+    # What one name leaves as white noise no torque beside it says better.
+    is_noise = len(fits[0].members) < 2 and above < 1 + _CLEARLY * math.sqrt(2 / problem.values)
+    sets += with_drivers(search, axis, by_members, is_noise)
     twins, beside, noise = problem.library.twins, search.nuisance.shape[1], fits[0].noise
 
     def named(level: float) -> list[Named]:

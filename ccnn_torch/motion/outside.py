@@ -81,9 +81,9 @@ class _Beside(NamedTuple):
     does: Tensor
 
 
-def with_drivers(found: Search, axis: int, fits: Mapping[Members, Fit]) -> list[Candidate]:
+def with_drivers(found: Search, axis: int, fits: Mapping[Members, Fit], is_noise: bool) -> list[Candidate]:
     """Drivers beside the most probable sets and those that lead from the best one to none; torques that follow one also
-    beside the names that promise most with them in place."""
+    beside the names that promise most with them in place, unless the best set leaves noise (`is_noise`)."""
     problem = found.problem
     chain = [found.found[axis][0]]
     while chain[-1].members:
@@ -92,7 +92,7 @@ def with_drivers(found: Search, axis: int, fits: Mapping[Members, Fit]) -> list[
     bases = {f.members: f.spec for f in [*found.found[axis][:_BASES], *chain]}
     sets = [one for spec in bases.values() for one in _beside(found, axis, spec)]
     every = list(enumerate(drivers_of(problem, axis, problem.data.position[axis])))
-    for name in _FOLLOWED:
+    for name in () if is_noise else _FOLLOWED:
         tried = [k for k, driver in every if driver.name == name and driver.is_torque]
         sets += [one for several in _beside_torque(found, axis, tried, fits) for one in several]
     taken: dict[int, dict[Members, float]] = {}
@@ -103,10 +103,10 @@ def with_drivers(found: Search, axis: int, fits: Mapping[Members, Fit]) -> list[
     squares = problem.unit[axis].square()
     slight = float((problem.stamped[axis][problem.data.judged].square() / squares).mean()) * problem.values
     told = []
-    for k, (one, rest, *_) in sets:
-        if fits[one.members].left * problem.values / float(squares) - rest >= slight:
+    for k, (candidate, rest, *_) in sets:
+        if fits[candidate.members].left * problem.values / float(squares) - rest >= slight:
             # Beside a driver a name has to do what the driver does not do as well.
-            told.append(one._replace(members=essential(one.members, taken[k], {})))
+            told.append(candidate._replace(members=essential(candidate.members, taken[k], {})))
     return told
 
 
