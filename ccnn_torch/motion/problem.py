@@ -95,15 +95,21 @@ class Problem:
         """Numbers of the nominal model of every axis, `n x k`."""
         return torch.zeros(len(self.unit), self.library.size, dtype=torch.float64)
 
-    def pushed(self, theta: Tensor, torque: Tensor) -> Tensor:
+    def under(self, axis: int, torque: Tensor) -> Problem:
+        """The same with a torque that resists the motor of an axis, over the gain, `b x s` [rad or m]."""
+        push = torch.zeros_like(self.driven.followed) if self.driven.torque is None else self.driven.torque.clone()
+        push[axis] += torque
+        return replace(self, data=self.data.under(push), driven=self.driven._replace(torque=push))
+
+    def pushed(self, theta: Tensor, axis: Tensor, torque: Tensor) -> Tensor:
         """Positions under torques that resist the motors, over the gain, one after the other.
 
         Args:
-            theta: `n x k`.
-            torque: `n x m x b x s` [rad or m].
+            theta, axis: as of `positions`.
+            torque: of every axis, `n x m x b x s` [rad or m].
 
         Returns:
-            `n x m x b x s`.
+            `p x m x b x s`.
         """
         n, m, b, s = torque.shape
         own = self.driven
@@ -112,8 +118,8 @@ class Problem:
         wide = self.of(torch.arange(b).repeat(m))
         run = wide.data.run + (int(wide.data.run.max()) + 1) * torch.arange(m).repeat_interleave(b)
         data, driven = wide.data._replace(run=run), wide.driven._replace(torque=every)
-        moved = replace(wide, data=data.under(every), driven=driven)._moved(theta, self.axes).reshape(n, m, b, s)
-        return moved if own.simulated is None else moved + self._beyond[:, None]
+        moved = replace(wide, data=data.under(every), driven=driven)._moved(theta, axis).reshape(-1, m, b, s)
+        return moved if own.simulated is None else moved + self._beyond[axis][:, None]
 
     def nuisance(self, theta: Tensor) -> Tensor:
         """What the positions change by when a nominal parameter is off by what it is known to, `k x n x b x s`.

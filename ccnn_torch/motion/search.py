@@ -64,13 +64,13 @@ class Search(NamedTuple):
 
 def log_posterior(fit: Fit) -> float:
     """Log evidence with the prior of the set, not normalised."""
-    return fit.log_evidence + prior_of(fit)
+    return fit.log_evidence + prior_of(fit.spec)
 
 
-def prior_of(fit: Fit, drivers: int = 0) -> float:
+def prior_of(spec: Spec, drivers: int = 0) -> float:
     """Log prior of a set, beside so many drivers of something outside the library."""
-    count = len(fit.members)
-    return fit.spec.log_prior + EFFECT * count + OUTSIDE * drivers + crowd(count + drivers)
+    count = len(spec.members)
+    return spec.log_prior + EFFECT * count + OUTSIDE * drivers + crowd(count + drivers)
 
 
 def search(problem: Problem) -> Search:
@@ -161,7 +161,7 @@ class _Pool:
                 side_by_side([f.grams for f in new]), self.nuisance.shape[1], [f.spec.groups for f in new], variance
             )
             for fit, evidence in zip(new, weighed_new.log_evidence.tolist(), strict=True):
-                old[variance, fit.members] = evidence + prior_of(fit), fit
+                old[variance, fit.members] = evidence + prior_of(fit.spec), fit
         found = [(log_posterior(fit), fit) if variance is None else old[variance, fit.members] for fit in fits]
         return sorted(found, key=lambda one: (-_level(one[0]), one[1].members))
 
@@ -304,7 +304,7 @@ class _Pool:
         wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
         pairs = [(i, fit) for i, own in enumerate(bases) for fit in own]
         variances = [self.noise_of(i) for i, _ in pairs]
-        promised = promises(self.problem, self.whitening, pairs, self.nuisance, variances)
+        promised = promises(self.problem, self.whitening, [(i, fit.spec) for i, fit in pairs], self.nuisance, variances)
         for (i, fit), found in zip(pairs, promised, strict=True):
             if not fit.members:
                 # Alone an effect is tried from wherever it may begin: limits are far from linear.
@@ -349,7 +349,7 @@ def with_gain(library: Library, axis: int, spec: Spec) -> Spec | None:
 def promises(
     problem: Problem,
     whitening: Whitening,
-    bases: Sequence[tuple[int, Fit]],
+    bases: Sequence[tuple[int, Spec]],
     nuisance: Tensor,
     variances: Sequence[float | None],
 ) -> list[list[tuple[float, Variant]]]:
@@ -364,18 +364,23 @@ def promises(
     """
     library = problem.library
     variants = [
-        [v for own in library.variants for v in own if v.effect not in fit.members and bool(library.there[i, v.effect])]
-        for i, fit in bases
+        [
+            v
+            for own in library.variants
+            for v in own
+            if v.effect not in spec.members and bool(library.there[i, v.effect])
+        ]
+        for i, spec in bases
     ]
     if not bases:
         return []
-    axis, theta = torch.tensor([i for i, _ in bases]), torch.stack([fit.spec.theta for _, fit in bases])
-    residual, own = sensitivities(problem, whitening, theta, axis, [fit.spec.flat for _, fit in bases])
+    axis, theta = torch.tensor([i for i, _ in bases]), torch.stack([spec.theta for _, spec in bases])
+    residual, own = sensitivities(problem, whitening, theta, axis, [spec.flat for _, spec in bases])
     # A row for every number of every variant.
     rows, moved, steps = [], [], []
-    for b, (i, fit) in enumerate(bases):
+    for b, (i, spec) in enumerate(bases):
         for variant, a, j in ((v, a, j) for v in variants[b] for a, j in enumerate(v.active)):
-            changed, value = fit.spec.theta.clone(), float(variant.values[i, a])
+            changed, value = spec.theta.clone(), float(variant.values[i, a])
             steps.append(value if abs(value) > 1e-6 else _STEP)
             changed[j] += steps[-1]
             changed[list(variant.held)] = variant.shapes[i]
@@ -387,14 +392,14 @@ def promises(
     left = white_residual(problem, whitening, torch.stack(moved), axis[at])
     new = (residual[at] - left) / left.new_tensor(steps)[:, None]
     found = []
-    for b, (i, fit) in enumerate(bases):
-        flat = list(fit.spec.flat)
+    for b, (i, spec) in enumerate(bases):
+        flat = list(spec.flat)
         x = torch.cat([own[b, : len(flat)], new[at == b]])
         grams = products(nuisance[i], x, residual[b] + theta[b, flat] @ x[: len(flat)], problem.values)
         widths = torch.tensor([len(v.active) for v in variants[b]], dtype=torch.int64)
         ends = (widths.cumsum(0) + len(flat)).tolist()
         sets = [
-            [*fit.spec.groups, torch.arange(end - len(v.active), end)] for v, end in zip(variants[b], ends, strict=True)
+            [*spec.groups, torch.arange(end - len(v.active), end)] for v, end in zip(variants[b], ends, strict=True)
         ]
         scores = weighed(grams, len(nuisance[i]), sets, variances[b]).log_evidence.tolist() if sets else []
         found.append(
