@@ -135,6 +135,16 @@ def test_a_rotation_matrix_is_refused_and_not_lost(tmp_path: Path) -> None:
         load_records(tmp_path / "records.csv", Arm())
 
 
+def test_a_rotation_matrix_of_a_hexapod_is_not_lost_either(tmp_path: Path) -> None:
+    machine = load_mechanism("stewart")
+    joints = machine.sample_joints(ROWS, torch.Generator().manual_seed(0)).numpy()
+    told = {f"q{k + 1}[m]": joints[:, k] for k in range(6)} | {f"{c}[m]": joints[:, 0] for c in "xyz"}
+    matrix = {f"r{i}{k}[1]": joints[:, 0] for i in (1, 2, 3) for k in (1, 2, 3)}
+    write_table(tmp_path / "records.csv", told | matrix)
+    with pytest.raises(InputError, match="would not be used; a matrix is not read, give the quaternion"):
+        load_records(tmp_path / "records.csv", machine)
+
+
 def test_angles_that_are_not_complete(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no column 'kuka_c'"):
         load(tmp_path, ("kuka_a", "kuka_b"))

@@ -172,7 +172,7 @@ EULER_ANGLES = {
 }
 """Angles as controllers give them: columns, and the axes for scipy (capitals: about the moved axes)."""
 
-_ROTATION_VECTOR = ("rx", "ry", "rz")
+ROTATION_VECTOR = ("rx", "ry", "rz")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 # One turn of a pose angle, rounded up so that 360 degrees written as 6.2832 passes.
 _POSE_LIMIT = 6.3
@@ -249,16 +249,16 @@ def read_pose(
         table = _without_empty(table, mechanism)
     names = {c.name for c in mechanism.pose}
     # Any machine that turns about three axes may have its orientation in another form than its own coordinates.
-    turns_freely = set(_ROTATION_VECTOR) <= names and any(
+    turns_freely = set(ROTATION_VECTOR) <= names and any(
         named.format(c) in table for c in (*_QUATERNION, *(c for columns, _ in EULER_ANGLES.values() for c in columns))
     )
     if not mechanism.orientations and not turns_freely:
         pose = _measured(table, mechanism.pose, mechanism) if partial else mechanism.pose
         pose = tuple(pose or mechanism.pose)
         return _together(stacked(pose, _POSE_LIMIT), pose), pose, None, tuple(named.format(c.name) for c in pose)
-    position = tuple(c for c in mechanism.pose if c.name not in _ROTATION_VECTOR)
-    turns = tuple(Coordinate(name, "rad") for name in _ROTATION_VECTOR)
-    forms = {"rotation_vector": _ROTATION_VECTOR, "quaternion": _QUATERNION}
+    position = tuple(c for c in mechanism.pose if c.name not in ROTATION_VECTOR)
+    turns = tuple(Coordinate(name, "rad") for name in ROTATION_VECTOR)
+    forms = {"rotation_vector": ROTATION_VECTOR, "quaternion": _QUATERNION}
     forms |= {name: columns for name, (columns, _) in EULER_ANGLES.items()}
     form = next((name for name, columns in forms.items() if any(named.format(c) in table for c in columns)), "none")
     if partial:
@@ -291,15 +291,15 @@ def read_pose(
 def _without_empty(table: Table, mechanism: HasCoordinates) -> Table:
     """The table without columns of a pose whose cells are all empty."""
     names = {c.name for c in mechanism.pose}
-    names |= {*_ROTATION_VECTOR, *_QUATERNION, *(name for columns, _ in EULER_ANGLES.values() for name in columns)}
+    names |= {*ROTATION_VECTOR, *_QUATERNION, *(name for columns, _ in EULER_ANGLES.values() for name in columns)}
     return table.without([name for name in table.names if name in names and table.blank(name).all()])
 
 
 def _together(pose: NDArray[np.float64], coordinates: Sequence[Coordinate]) -> NDArray[np.float64]:
     """The pose with all of rx, ry, rz NaN where one of them is: a rotation vector means nothing in part."""
     names = [c.name for c in coordinates]
-    if set(_ROTATION_VECTOR) <= set(names):
-        turns = [names.index(name) for name in _ROTATION_VECTOR]
+    if set(ROTATION_VECTOR) <= set(names):
+        turns = [names.index(name) for name in ROTATION_VECTOR]
         # One NaN makes the sum NaN.
         pose[:, turns] += 0 * pose[:, turns].sum(1, keepdims=True)
     return pose
@@ -320,7 +320,7 @@ def pose_columns(pose: NDArray[np.float64], form: str | None) -> dict[str, NDArr
     if form in EULER_ANGLES:
         columns, axes = EULER_ANGLES[form]
         return dict(zip(columns, turn.as_euler(axes).T, strict=True))
-    return dict(zip(_ROTATION_VECTOR, pose[:, 3:].T, strict=True))
+    return dict(zip(ROTATION_VECTOR, pose[:, 3:].T, strict=True))
 
 
 def _measured(table: Table, pose: Sequence[Coordinate], mechanism: HasCoordinates) -> tuple[Coordinate, ...]:
@@ -373,7 +373,7 @@ def check_orientation(table: Table, mechanism: HasCoordinates, unused: Iterable[
     Raises:
         InputError: names the columns, and the map to write.
     """
-    if not any(coordinate.name in _ROTATION_VECTOR for coordinate in mechanism.pose):
+    if not any(coordinate.name in ROTATION_VECTOR for coordinate in mechanism.pose):
         return
     folded = {_folded(name): name for name in unused if _may_be_angle(table.units[name])}
     together = next((letters for letters in _TOGETHER if all(letter in folded for letter in letters)), ())
@@ -390,7 +390,7 @@ def check_orientation(table: Table, mechanism: HasCoordinates, unused: Iterable[
     elif turned:
         say = f"a matrix is not read, give the quaternion {', '.join(_QUATERNION)} (scipy: Rotation.from_matrix)"
     else:
-        known = [_ROTATION_VECTOR, _QUATERNION, *(columns for columns, _ in EULER_ANGLES.values())]
+        known = [ROTATION_VECTOR, _QUATERNION, *(columns for columns, _ in EULER_ANGLES.values())]
         say = f"map them with columns: to one of {'; '.join(', '.join(names) for names in known)}"
     ignored = ", ".join(f'"{table.header(name)}": ignore' for name in found)
     raise InputError(

@@ -18,6 +18,7 @@ from ccnn_torch.records.commanded import Moving, is_open, read_joints
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES, choose_covariates
 from ccnn_torch.records.headers import (
     JOINT_LIMIT,
+    ROTATION_VECTOR,
     HasCoordinates,
     check_orientation,
     read_pose as read_pose,
@@ -238,7 +239,7 @@ def load_records(
     doubt = "; ".join(filter(None, [doubt, _beyond_limits(mechanism, joints), _half_signs(table, chosen)]))
     unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
     lacking = {c.name for c in mechanism.pose} - {c.name for c in coordinates}
-    if orientation == "none":
+    if orientation == "none" or {*ROTATION_VECTOR} <= lacking:
         check_orientation(table, mechanism, unused)
     if learns:
         _check_enough(table, len(mechanism.joints) + len(chosen))

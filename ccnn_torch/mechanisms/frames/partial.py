@@ -220,8 +220,8 @@ def as_measured(
     if unknown:
         raise InputError(
             f"{where}: of the pose {', '.join(whole)} only {', '.join(names)} was measured, which does not show where "
-            f"the {' and the '.join(unknown)} of {mechanism.name} {'is' if len(unknown) == 1 else 'are'}; give x, y, z "
-            "as well, or a machine whose frames are known"
+            f"the {' and the '.join(unknown)} of {mechanism.name} {'is' if len(unknown) == 1 else 'are'}; give "
+            f"{', '.join(n for n in whole if n not in names)} as well, or a machine whose frames are known"
         )
     return Partial(mechanism, names)
 
