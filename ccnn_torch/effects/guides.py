@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,12 +14,31 @@ from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
-# Legendre's polynomials of the degrees 1 to 4, by the powers 0 to 4.
-_LEGENDRE = ((0, 1, 0, 0, 0), (-0.5, 0, 1.5, 0, 0), (0, -1.5, 0, 2.5, 0), (0.375, 0, -3.75, 0, 4.375))
+
+
+class _Form(NamedTuple):
+    """How large a motion is along the way of a joint: of -1 to 1 over its travel, or of its angle [rad]."""
+
+    name: str
+    of: Callable[[Tensor], Tensor]
+    secondary: bool
+
+
+# Legendre's polynomials of the degrees 1 to 4.
+_SLIDES = (
+    _Form("1", lambda u: u, False),
+    _Form("2", lambda u: 1.5 * u**2 - 0.5, False),
+    _Form("3", lambda u: (2.5 * u**2 - 1.5) * u, True),
+    _Form("4", lambda u: (4.375 * u**2 - 3.75) * u**2 + 0.375, True),
+)
+_TURNS = (
+    _Form("sin", torch.sin, False),
+    _Form("cos", torch.cos, False),
+    _Form("sin 2", lambda q: torch.sin(2 * q), True),
+    _Form("cos 2", lambda q: torch.cos(2 * q), True),
+)
 # Of machine tools as built over a metre [m], [rad] (ISO 10791-1); the rows say what it is here.
 _SIZE = {"m": 1e-5, "rad": 2e-5}
-# Up to here a form is that of a bow or a twist; beyond it is secondary.
-_SIMPLE = 2
 
 
 class ErrorMotion(Effect):
@@ -39,38 +59,41 @@ class ErrorMotion(Effect):
         return "" if slides else "a joint that slides, in a machine whose links follow one another"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """Of each sliding joint the shifts and turns of its first polynomial, then of the next."""
-        joints = situation.mechanism.joints
+        """Of each joint the shifts and turns of its first form, then of the next."""
         return tuple(
-            Coefficient(
-                f"{joints[i].name} {name} {degree}", unit, _SIZE[unit], joints[i].name, secondary=degree > _SIMPLE
-            )
-            for i in _sliding(situation)
-            for degree in range(1, len(_LEGENDRE) + 1)
-            for name, unit in TWIST
-            if degree > 1 or unit == "rad"
+            Coefficient(f"{joint.name} {name} {form.name}", unit, _SIZE[unit], joint.name, secondary=form.secondary)
+            for i, joint in enumerate(_arm(situation).joints)
+            for form, motions in _motions(_arm(situation), i)
+            for name, unit in (TWIST[k] for k in motions)
         )
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
-        arm = situation.whole.mechanism
-        assert isinstance(arm, SerialArm)
+        arm = _arm(situation)
         values = arm.resolve(situation.whole.parameters)
         base, frames = rotation_vector_to_matrix(values[..., 3:6]), arm.link_frames(situation.joints, values)
         low, high = arm.limits.unbind(-1)
-        travel = ((2 * situation.joints - low - high) / (high - low).clamp_min(1e-9)).clamp(-1, 1)[..., None]
-        forms = torch.cat([travel**k for k in range(len(_LEGENDRE) + 1)], -1) @ travel.new_tensor(_LEGENDRE).mT
-        parts = []
-        for i in _sliding(situation):
+        travel = ((2 * situation.joints - low - high) / (high - low).clamp_min(1e-9)).clamp(-1, 1)
+        found = []
+        for i, joint in enumerate(arm.joints):
             turn, place = frames[i + 1]
             origin = (base @ place[..., None])[..., 0] + values[..., :3]
             twist = twist_columns(situation, situation.platform[0] - origin, base @ turn)
-            columns = (twist[..., None, :] * forms[..., i, None, :, None]).flatten(-2)
-            parts.append(columns[..., len(TWIST) // 2 :])
-        return torch.cat(parts, -1)
+            at = situation.joints[..., i] if joint.unit == "rad" else travel[..., i]
+            found += [twist[..., motions] * form.of(at)[..., None, None] for form, motions in _motions(arm, i)]
+        return torch.cat(found, -1)
 
 
-def _sliding(situation: Situation) -> list[int]:
+def _arm(situation: Situation) -> SerialArm:
     arm = situation.whole.mechanism
     assert isinstance(arm, SerialArm)
-    return torch.nonzero(~arm.revolute).flatten().tolist()
+    return arm
+
+
+def _motions(arm: SerialArm, joint: int) -> list[tuple[_Form, list[int]]]:
+    """Forms in which what a joint carries moves, and the numbers of these motions in a twist."""
+    if arm.joints[joint].unit == "m":
+        return [(form, [k for k in range(len(TWIST)) if k > 2 or degree > 1]) for degree, form in enumerate(_SLIDES, 1)]
+    # A turn about the joint's own axis is an error of its drive.
+    across = [k for k in range(len(TWIST)) if k != 3 + arm.along_axis[joint]]
+    return [(form, across) for form in _TURNS]

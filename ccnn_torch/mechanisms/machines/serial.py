@@ -65,6 +65,7 @@ class SerialArm(Closest):
             unit; of i = j joint i is off by that share (lead, gear ratio).
         leans: links (from 1) with a fifth Denavit-Hartenberg parameter, betai [rad], by which the axis at the link's
             end (modified: its own) leans about y of the frame there: Ry(beta) after (modified: before) the others.
+        along_axis: which axis of the frame that a joint carries, from 0, is nearest to the joint's own.
         own_drives: what these and the tables of pitch errors do.
     """
 
@@ -179,6 +180,11 @@ class SerialArm(Closest):
         told = {k: v for k, v in every.items() if v or k not in ("goal_tool", "tables", "leans")}
         self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(told))}
         self._follow_nominal()
+        carried = self.axes
+        if self._axis_before:
+            turns, _ = self.link_transforms(torch.zeros(n, dtype=torch.float64), self.nominal)
+            carried = (turns.mT @ self.axes[..., None])[..., 0]
+        self.along_axis: list[int] = carried.abs().argmax(-1).tolist()
 
     def _follow_nominal(self) -> None:
         """The best-conditioned of 64 fixed draws (many arms are singular at zero); the box of poses from the reach."""
