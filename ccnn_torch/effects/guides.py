@@ -1,4 +1,4 @@
-"""Guides of sliding axes that shift and turn what they carry while it travels."""
+"""Guides and bearings that shift and turn what a joint carries while it moves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
-
 
 
 class _Form(NamedTuple):
@@ -42,20 +41,22 @@ _SIZE = {"m": 1e-5, "rad": 2e-5}
 
 
 class ErrorMotion(Effect):
-    """Δx = Σ P_k(u) (t_k + ω_k × (x - o)), ΔR = Σ P_k(u) ω_k: error motions of linear axes (ISO 230-1:2012, 3.4).
+    """Δx = Σ f_k(q) (t_k + ω_k × (x - o)), ΔR = Σ f_k(q) ω_k: error motions of axes (ISO 230-1:2012, 3.4; ISO 230-7).
 
-    u is a sliding joint's place in its travel, -1 to 1, P_k Legendre's polynomial of degree k = 1 to 4, o the origin of
-    the frame that the joint carries, and t and ω are along and about that frame's axes. Shifts begin with degree 2:
-    those in proportion to the travel are leads and squarenesses. Above degree 2 they are secondary.
+    Of a sliding joint f_k is Legendre's polynomial of degree k = 1 to 4 of its place in its travel, -1 to 1; of one
+    that turns sin q, cos q, sin 2q and cos 2q: once a turn, as a bearing that runs out or an axis that wobbles, and
+    twice. o is the origin of the frame that the joint carries, and t and ω are along and about that frame's axes.
+    Shifts in proportion to the travel are leads and squarenesses and no error motion; turns about a joint's own axis
+    are an error of its drive. Degrees above 2, and twice a turn, are secondary.
     """
 
     name = "error_motion"
     kind = "pose"
-    description = "guides of sliding axes that are bent or twisted: what they carry shifts and turns as it travels"
+    description = "guides and bearings of a machine tool that shift and turn what they carry as it moves"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """A joint that slides, of an arm."""
-        slides = isinstance(arm := inside(mechanism), SerialArm) and not bool(arm.revolute.all())
+        """A joint that slides, of an arm: where all turn, their drives and links are off by far more."""
+        slides = isinstance(arm := inside(mechanism), SerialArm) and any(j.unit == "m" for j in arm.joints)
         return "" if slides else "a joint that slides, in a machine whose links follow one another"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:

@@ -35,11 +35,12 @@ _WORDS = {
         "tolerance.",
     ),
     "error_motion": Words(
-        "guides that are bent or twisted",
-        "error motion of the guide",
-        "Shift along x, y, z and turn about x, y, z of what the joint carries, by Legendre's polynomial of that degree "
-        "from one end of its travel (-1) to the other (1).",
-        "Guides of {where}: their alignment, their bed, and the load on them.",
+        "guides or bearings that do not run true",
+        "error motion of the axis",
+        "Shift along x, y, z and turn about x, y, z of what the joint carries: of a sliding joint by Legendre's "
+        "polynomial of that degree from one end of its travel (-1) to the other (1), of a turning one by the sine or "
+        "cosine of its angle, or of twice that.",
+        "Guides and bearings of {where}: their alignment, their bed, and the load on them.",
     ),
     "joint_offset": Words(
         "an offset of the joints",

@@ -411,6 +411,20 @@ def test_a_guide_shifts_and_turns_all_that_it_carries_about_where_its_carriage_i
     assert not found["q3 rx 1"][:, :3].any()
 
 
+def test_a_table_that_wobbles_tilts_what_it_carries_across_its_axis(tmp_path: Path) -> None:
+    file = tmp_path / "table.yaml"
+    file.write_text("machine: five_axis_table_table\n")
+    machine = load_mechanism(str(file))
+    joints = torch.tensor([[0.5, 0.0, 0.1, 0.2, 0.3]], dtype=torch.float64)
+    found = columns(make_effect("error_motion"), Situation(machine, joints, {}, default_gravity(machine)), NO_SHAPE)
+    assert len(found) == 2 * 20 + 3 * 21 and "q1 rz sin" not in found and "q2 rx sin" not in found
+    # Of the table C, which turns all that comes after it about -z.
+    turn = torch.tensor([[0.877582561890, 0.479425538604], [-0.479425538604, 0.877582561890]], dtype=torch.float64)
+    for name, size in (("x sin", 0.479425538604), ("x cos 2", 0.540302305868)):
+        assert torch.allclose(found[f"q1 {name}"][0, :2], size * turn[:, 0])
+    assert torch.allclose(found["q1 rx sin"][0, 3:5], 0.479425538604 * turn[:, 0])
+
+
 def test_lengths_grow_with_each_further_thermometer_by_what_it_shows_beyond_the_first() -> None:
     rows = situation("tripod")
     hotter = replace(rows, covariates={**rows.covariates, "temperature_drives": rows.covariates["temperature"] + 5})
