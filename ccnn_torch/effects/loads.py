@@ -335,8 +335,8 @@ class Bending(Effect):
         return "positions: what bends turns a direction as flexure does" if sees_directions(mechanism) else ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """By load (where one was recorded), by weight, by a weight at the tool and by the link's own, link by link; then
-        of the base by what pulls."""
+        """By load (where one was recorded), by weight, by a weight at the tool and by the link's own, link by link;
+        then of the base by what pulls."""
         kinds = [(f"weight{part}", "rad/m^2", PLATFORM_WEIGHT) for part in _OF_BEAM]
         kinds += [(pull, "rad/m^2", _SECONDARY * PLATFORM_WEIGHT) for pull in ("tool", "tool twist", "own")]
         if situation.loaded:
