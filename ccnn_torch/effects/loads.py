@@ -306,21 +306,27 @@ class Gravity(Effect):
 
 # What a beam does under what pulls at its end.
 _OF_BEAM = ("", " twist")
+# How a base tilts under a moment, in its own axes: symmetric in x and y, since its stiffest and its softest axis are
+# square to each other. A turn about z is one of the first joint.
+_OF_BASE = {"x": ((1, 0, 0), (0, 0, 0), (0, 0, 0)), "y": ((0, 0, 0), (0, 1, 0), (0, 0, 0))}
+_OF_BASE["xy"] = ((0, 1, 0), (1, 0, 0), (0, 0, 0))
 
 
 class Bending(Effect):
-    """Links of an arm that bend and twist between their joints as beams of one section, clamped at the joint before.
+    """Links of an arm that bend and twist between their joints as beams of one section, clamped at the joint before;
+    and a base that tilts on what it stands on.
 
     Under a force F and a moment M at its end a beam of length L gives F L³ / 3EI + M L² / 2EI and turns by
     F L² / 2EI + M L / EI (Euler and Bernoulli), and by M L / GJ about itself. Coefficients of a link: 1/EI for the
     recorded load; weight / EI for own weight, 1 N of which is spread evenly over the origins of the links and the tool.
     Secondary: the same for a weight at the tool alone, and of each 1/GJ; and for the weight of the link itself along
-    it, which gives F L³ / 8EI and turns by F L² / 6EI. To first order about the nominal pose.
+    it, which gives F L³ / 8EI and turns by F L² / 6EI. The base tilts about its origin by C M, M the moment there and C
+    a symmetric matrix in its axes x and y: a table is softer in one direction. To first order about the nominal pose.
     """
 
     name = "bending"
     kind = "pose"
-    description = "links of an arm that bend between their joints under their own weight or a load"
+    description = "links of an arm that bend between their joints, or a base that tilts, under own weight or a load"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """Links, and positions."""
@@ -329,23 +335,32 @@ class Bending(Effect):
         return "positions: what bends turns a direction as flexure does" if sees_directions(mechanism) else ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """By load (where one was recorded), by weight, by a weight at the tool and by the link's own, link by link."""
+        """By load (where one was recorded), by weight, by a weight at the tool and by the link's own, link by link;
+        then of the base by what pulls."""
         kinds = [(f"weight{part}", "rad/m^2", PLATFORM_WEIGHT) for part in _OF_BEAM]
         kinds += [(pull, "rad/m^2", _SECONDARY * PLATFORM_WEIGHT) for pull in ("tool", "tool twist", "own")]
         if situation.loaded:
             kinds = [(f"load{part}", "rad/N/m^2", 1.0) for part in _OF_BEAM] + kinds
         main = ("load", "weight")
-        return tuple(
+        links = [
             Coefficient(f"link {i + 1} {kind}", unit, GIVE["rad"] * size, joint.name, None, kind not in main)
             for i, joint in enumerate(situation.mechanism.joints)
             for kind, unit, size in kinds
-        )
+        ]
+        base = [
+            Coefficient(f"base {kind} {axes}", unit.replace("m^2", "m"), GIVE["rad"] * size, secondary=kind not in main)
+            for kind, unit, size in kinds
+            if kind in (*main, "tool")
+            for axes in _OF_BASE
+        ]
+        return (*links, *base)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
         arm = situation.whole.mechanism
         assert isinstance(arm, SerialArm)
-        points, _ = arm_axes(arm, situation.joints, arm.resolve(situation.whole.parameters))
+        values = arm.resolve(situation.whole.parameters)
+        points, _ = arm_axes(arm, situation.joints, values)
         tool = situation.platform[0].unsqueeze(-2)
         ends = torch.cat([points[..., 1:, :], tool.expand_as(points)[..., :1, :]], -2)
         beam, beyond, n = ends - points, tool - ends, points.shape[-2]
@@ -360,7 +375,14 @@ class Bending(Effect):
             pulls.insert(0, (wrench[..., :3], moment + wrench[..., 3:] if wrench.shape[-1] == 6 else moment))
         bent = [_of_beam(beam, *pull, beyond) for pull in pulls]
         own = _of_beam(beam, down, torch.zeros_like(beam), beyond, (1 / 6, 1 / 8))[..., :1, :]
-        columns = torch.cat([*bent, own], -2).flatten(-3, -2)
+        foot, turn = values[..., None, :3], rotation_vector_to_matrix(values[..., 3:6])
+        tilts = turn[..., None, :, :] @ torch.tensor([*_OF_BASE.values()], dtype=turn.dtype) @ turn.mT[..., None, :, :]
+        tilted = []
+        for force, moment in pulls:
+            below = (moment + _cross(ends - foot, force))[..., :1, :]
+            angle = (tilts @ below.mT.unsqueeze(-3)).squeeze(-1)
+            tilted.append(torch.cat([_cross(angle, tool - foot), angle], -1))
+        columns = torch.cat([torch.cat([*bent, own], -2).flatten(-3, -2), *tilted], -2)
         return situation.visible @ columns[..., : situation.jacobian.shape[-2]].mT
 
 

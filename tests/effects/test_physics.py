@@ -396,6 +396,24 @@ def test_a_clamped_beam_gives_as_the_textbook_says_at_its_end_and_what_it_carrie
     assert torch.allclose(found, wanted[: len(found)], atol=1e-9)
 
 
+def test_a_base_tilts_under_the_moment_at_its_foot_softer_in_one_direction() -> None:
+    """A mast of 0.7 m and a boom of 2 m, turned by a right angle, on a base that stands aside and turned by 90°."""
+    base = [5.0, 6.0, 0.0, 0.0, 0.0, math.pi / 2]
+    arm = SerialArm("crane", "standard", [[0.0, 0.0, 0.7, 0.0], [2.0, 0.0, 0.0, 0.0]], base=base)
+    joints, load = torch.zeros(1, 2, dtype=torch.float64), -30.0
+    rows = Situation(arm, joints, {"load_z": torch.tensor([load], dtype=torch.float64)}, default_gravity(arm))
+    found = columns(make_effect("bending"), rows, NO_SHAPE)
+    # The boom is along the frame's y: the moment is about its x, the base's -y.
+    turn = load * 2.0
+    tilted = torch.tensor([0, -0.7 * turn, 2.0 * turn, turn, 0, 0], dtype=torch.float64)
+    across = torch.tensor([0.7 * -turn, 0, 0, 0, -turn, 0], dtype=torch.float64)
+    for name, wanted in (("y", tilted), ("xy", across), ("x", 0 * tilted)):
+        own = found[f"base load {name}"][0]
+        assert torch.allclose(own, wanted[: len(own)], atol=1e-9)
+    # Half of the weight hangs at the top of the mast, half at the tip.
+    assert torch.allclose(found["base weight y"][0], found["base load y"][0] / -load / 2)
+
+
 def test_a_guide_shifts_and_turns_all_that_it_carries_about_where_its_carriage_is() -> None:
     machine = load_mechanism(str(GANTRY))
     joints = torch.tensor([[0.25, 0.6, 0.1]], dtype=torch.float64)
