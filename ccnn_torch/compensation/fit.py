@@ -18,6 +18,7 @@ from ccnn_torch.compensation.machine import ASTRAY, FARTHEST, Machine, build_mac
 from ccnn_torch.compensation.routines import Functions, Variables, next_step, routines_of
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.effects import Acting, Situation, default_gravity
+from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners.constant import ConstantNetwork
 from ccnn_torch.mechanisms import Mechanism
@@ -387,9 +388,14 @@ def _care(rows: Situation) -> Care:
     return care._replace(gain=gain, inverse_gain=inverse_gain)
 
 
-def all_over(nominal: Mechanism) -> Situation:
-    """Rows all over the workspace of a machine of which nothing else is known."""
+def all_over(machine: FoundMachine) -> Situation:
+    """Rows all over the region of a machine; of geometry alone all over its workspace, and where it was measured."""
+    if len(machine.joints):
+        return machine.rows(ROWS)
+    nominal = machine.nominal
     joints = nominal.sample_joints(ROWS, torch.Generator().manual_seed(0))
+    if len(machine.beside):
+        joints = torch.cat([joints, machine._replace(joints=machine.beside).rows(ROWS).joints])
     return Situation(nominal, joints, {}, default_gravity(nominal))
 
 

@@ -343,7 +343,7 @@ class LoadedModel:
 
             from ccnn_torch.compensation.fit import all_over
 
-            joints = all_over(self.machine.nominal).joints
+            joints = all_over(self.machine).joints
             fine = joints[torch.isfinite(joints).all(-1)]
             measured = torch.stack([fine.amin(0), fine.amax(0)], -1)
         region: Array = measured.numpy()

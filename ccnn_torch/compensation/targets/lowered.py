@@ -68,7 +68,7 @@ class Found:
         """Commanded joints and covariates, `s x n`, of which all have a pose."""
         machine = self.model.machine
         if machine is not None:
-            rows = machine.rows(ROWS) if len(machine.joints) else all_over(machine.nominal)
+            rows = all_over(machine)
         else:
             low, high = torch.from_numpy(self.model.region).unbind(-1)
             share = torch.rand(ROWS, len(low), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
