@@ -132,7 +132,7 @@ def write_compensated(
             joints, units = poses.joints(table, shown) if poses is not None else _joints(loaded, table, back, shown)
             covariates = stack_columns(table, loaded.covariates) if loaded.covariates else None
             columns = {original.header(n): original.cells(n) for n in original.names}
-            there: NDArray[np.bool_] = np.isfinite(joints).all(-1)
+            there = np.asarray(np.isfinite(joints).all(-1))
             if not there.all():
                 result.unreached += int((~there).sum())
                 joints, covariates = joints[there], None if covariates is None else covariates[there]
