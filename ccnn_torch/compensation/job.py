@@ -42,12 +42,11 @@ class Compensated:
         outside: how many are outside the domain.
         damped: how many have a damped command.
         fallback: how many violate the limits of the model's card; `first` names the first.
-        unreached: how many were left out, since the machine does not reach their pose; `lost` says which.
+        lost: which were left out, since the machine does not reach their pose, in words; empty without any.
         branch: how the branch of an arm was chosen, where that was left open.
     """
 
     rows: int = 0
-    unreached: int = 0
     lost: str = ""
     outside: int = 0
     damped: int = 0
@@ -97,12 +96,12 @@ def compensate_table(
         poses = WantedPoses(loaded, allow_code, tool, base)
     found = write_compensated(loaded, input, output, poses, back, sd, allow_code=allow_code)
     said = sentences(output, found, loaded)
-    refused = (
+    violates = (
         f"{output}: in {found.fallback} of {found.rows} rows, the first from {found.first} of {input}, {loaded.path} "
         "violates the limits in its card (finite numbers, |deviation| within the limit); they were written without any "
         "correction and with inside_domain = 0: do not use this model"
     )
-    return said, "; ".join([found.lost] * (found.unreached > 0) + [refused] * (found.fallback > 0))
+    return said, "; ".join(filter(None, [found.lost, violates if found.fallback else ""]))
 
 
 def write_compensated(
@@ -134,7 +133,6 @@ def write_compensated(
             columns = {original.header(n): original.cells(n) for n in original.names}
             there = np.asarray(np.isfinite(joints).all(-1))
             if not there.all():
-                result.unreached += int((~there).sum())
                 joints, covariates = joints[there], None if covariates is None else covariates[there]
                 columns = {header: [*compress(cells, there)] for header, cells in columns.items()}
             with warnings.catch_warnings():

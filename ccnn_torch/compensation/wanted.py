@@ -158,16 +158,15 @@ class WantedPoses:
     def _beyond(self, mechanism: Mechanism, pose: Tensor) -> str:
         """The coordinate that is farthest beyond the poses of the region, and these; empty where none is."""
         poses = mechanism.forward_kinematics(_all_over(self._region))
-        poses = poses[torch.isfinite(poses).all(-1)]
-        low, high = poses.amin(0), poses.amax(0)
-        out = (torch.maximum(pose - high, low - pose) / (high - low).clamp_min(1e-12)).nan_to_num()
+        low, high = poses.nan_to_num(nan=torch.inf).amin(0), poses.nan_to_num(nan=-torch.inf).amax(0)
+        out = torch.maximum(pose - high, low - pose) / (high - low).clamp_min(1e-12)
         k = int(out.argmax())
-        if out[k] <= 0:
+        if not out[k] > 0:
             return ""
-        unit, name = mechanism.pose[k].unit, mechanism.pose[k].name
+        unit = mechanism.pose[k].unit
         shown = self._of_pose.get(unit, unit)
         value, least, most = (f"{float(from_si(v[k].item(), unit, shown)):.4g}" for v in (pose, low, high))
-        return f" ({name} = {value} {shown}; in the model's region it goes from {least} to {most} {shown})"
+        return f" ({mechanism.pose[k].name} = {value} {shown}; in the model's region {least} to {most} {shown})"
 
     def _of_the_measured_tool(self, poses: Tensor) -> Tensor:
         """Poses of the tool and in the frame with which the model was made, `s x p`."""
