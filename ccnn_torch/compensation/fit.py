@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -388,15 +389,18 @@ def _care(rows: Situation) -> Care:
     return care._replace(gain=gain, inverse_gain=inverse_gain)
 
 
-def all_over(machine: FoundMachine) -> Situation:
+def all_over(nominal: Mechanism) -> Situation:
+    """Rows all over the workspace of a machine of which nothing else is known."""
+    joints = nominal.sample_joints(ROWS, torch.Generator().manual_seed(0))
+    return Situation(nominal, joints, {}, default_gravity(nominal))
+
+
+def rows_of(machine: FoundMachine) -> Situation:
     """Rows all over the region of a machine; of geometry alone all over its workspace, and where it was measured."""
     if len(machine.joints):
         return machine.rows(ROWS)
-    nominal = machine.nominal
-    joints = nominal.sample_joints(ROWS, torch.Generator().manual_seed(0))
-    if len(machine.beside):
-        joints = torch.cat([joints, machine._replace(joints=machine.beside).rows(ROWS).joints])
-    return Situation(nominal, joints, {}, default_gravity(nominal))
+    rows, beside = all_over(machine.nominal), machine._replace(joints=machine.beside)
+    return replace(rows, joints=torch.cat([rows.joints, beside.rows(ROWS).joints])) if len(machine.beside) else rows
 
 
 def machine_alone(

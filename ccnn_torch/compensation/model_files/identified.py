@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.fit import all_over, machine_alone
+from ccnn_torch.compensation.fit import machine_alone, rows_of
 from ccnn_torch.compensation.model_files.load import MACHINE_FORMS, LoadedModel, load_compensation, read_model
 from ccnn_torch.compensation.model_files.metadata import card_of, from_json
 from ccnn_torch.compensation.model_files.signature import check_signature, sign_content, signature_path
@@ -28,7 +28,7 @@ def model_of_machine(path: Path, machine: FoundMachine, signed: bool = False) ->
         try:
             # The workspace has its own ends, records have not.
             margin = {} if len(machine.joints) or len(machine.beside) else {"margin": 0.0}
-            return machine_alone(all_over(machine), machine.values, machine.acting, machine.covariates, **margin)
+            return machine_alone(rows_of(machine), machine.values, machine.acting, machine.covariates, **margin)
         except (InputError, MethodFailedError) as reason:
             raise ModelFileError(f"{path}: {reason}") from None
 
