@@ -272,6 +272,11 @@ def starter_config(
         return _motion_config(records, out, mechanism, {})
     found = recognise(table, urdf_joints(mechanism) if mechanism and mechanism.lower().endswith(".urdf") else ())
     if not (found.joints or found.goals) or not found.pose:
+        if {"time", "command"} <= {name.rstrip("0123456789_ ") for name in map(str.lower, table.names)}:
+            raise InputError(
+                f"{records}: looks like a motion's log; name its columns time[s], command1[rad], q1[rad] (or deg, mm) "
+                f"and current1[A] if there is one, then ccnn diagnose --motion {records} --mechanism servo reads it"
+            )
         what = "measured pose (x, y, z …)"
         if not (found.joints or found.goals):
             what = "joint (q1, J1, A1, joint_1 …) or a commanded pose (goal_x, goal_y …)"

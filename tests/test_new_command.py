@@ -153,6 +153,9 @@ def test_tables_without_joints_or_with_strange_text(tmp_path: Path) -> None:
         starter_config(write(tmp_path / "a.csv", ["x[mm]", "y[mm]"], np.zeros((3, 2))), tmp_path / "a.yaml")
     with pytest.raises(InputError, match="measured pose"):
         starter_config(write(tmp_path / "b.csv", ["q1[deg]", "q2[deg]"], np.zeros((3, 2))), tmp_path / "b.yaml")
+    log = write(tmp_path / "log.csv", ["time", "command", "measured position", "current"], np.zeros((3, 4)))
+    with pytest.raises(InputError, match=r"command1\[rad\].*ccnn diagnose --motion .*log.csv"):
+        starter_config(log, tmp_path / "log.yaml")
     # A header cannot write keys of its own into the config.
     headers = ["q1[deg]", "q2[deg]", "x[mm]", "y[mm]", "a: 1 # out: /tmp/x", 'Time: "s" # out']
     values = np.random.default_rng(0).uniform(0.1, 1, (30, 6))

@@ -91,6 +91,7 @@ def test_a_quarter_turn_of_each(tmp_path: Path) -> None:
         (("roll", "pitch", "yaw"), "[rad]", ("columns roll, pitch, yaw", "map them")),
         (("Euler_1",), "", ("columns Euler_1",)),
         (("QW", "QX"), "[1]", ("columns QW, QX",)),
+        (("A", "B"), "[deg]", ("one of three angles is missing: give all of kuka_a, kuka_b, kuka_c",)),
     ],
 )
 def test_an_orientation_that_would_be_lost(
@@ -105,7 +106,7 @@ def test_an_orientation_that_would_be_lost(
 
 
 def test_what_is_no_orientation_or_is_not_missed_passes(tmp_path: Path) -> None:
-    assert load(tmp_path, ("A", "B"), "[deg]").orientation == "none"
+    assert load(tmp_path, ("A",), "[deg]").orientation == "none"
     assert load(tmp_path, ("A", "B", "C"), "[mm]").orientation == "none"
     beside = arm_columns() | dict(zip(("A[deg]", "B[deg]", "C[deg]"), ANGLES.T, strict=True))
     write_table(tmp_path / "records.csv", beside)

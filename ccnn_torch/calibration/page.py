@@ -170,7 +170,7 @@ def worse_text(results: RunResults) -> str:
     if parts and position.explained is not None and (position.explained.rms.median or after) <= _WORSE * alone:
         return (
             f"{text}: the model is right, but its file holds commands back near singular poses or at limits; "
-            "ccnn identify, then ccnn compensate identified.yaml, commands by the geometry."
+            "what it explains is reached in the rows whose status is 0."
         )
     if "effects" in parts and "effects" not in instead:
         return f"{text}: effects=none leaves the effects out."

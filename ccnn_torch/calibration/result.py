@@ -44,16 +44,18 @@ from ccnn_torch.report.results.run import (
     WithoutOutliers,
 )
 from ccnn_torch.simulation.case_study import Simulation
+from ccnn_torch.version import __version__
 
 # Above so many times what the model explains a sentence says why.
 _REACHED = 1.1
 _NO_GEOMETRY = Geometry(chosen="none", why="A simulated case compares learners.")
-_PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
+_PACKAGES = ("torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
 
 
 def versions() -> dict[str, str]:
     """Versions of this package and of those that decide its numbers."""
-    return {name: version(name) for name in _PACKAGES}
+    # A checkout that is not installed has no metadata.
+    return {"ccnn-torch": __version__, **{name: version(name) for name in _PACKAGES}}
 
 
 def plan_of(config: RunConfig) -> Plan:

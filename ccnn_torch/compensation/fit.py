@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from ccnn_torch.compensation.machine import ASTRAY, FARTHEST, Machine, build_mac
 from ccnn_torch.compensation.routines import Functions, Variables, next_step, routines_of
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.effects import Acting, Situation, default_gravity
+from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners.constant import ConstantNetwork
 from ccnn_torch.mechanisms import Mechanism
@@ -391,6 +393,14 @@ def all_over(nominal: Mechanism) -> Situation:
     """Rows all over the workspace of a machine of which nothing else is known."""
     joints = nominal.sample_joints(ROWS, torch.Generator().manual_seed(0))
     return Situation(nominal, joints, {}, default_gravity(nominal))
+
+
+def rows_of(machine: FoundMachine) -> Situation:
+    """Rows all over the region of a machine; of geometry alone all over its workspace, and where it was measured."""
+    if len(machine.joints):
+        return machine.rows(ROWS)
+    rows, beside = all_over(machine.nominal), machine._replace(joints=machine.beside)
+    return replace(rows, joints=torch.cat([rows.joints, beside.rows(ROWS).joints])) if len(machine.beside) else rows
 
 
 def machine_alone(

@@ -5,11 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.model_files.metadata import Array
@@ -41,10 +42,12 @@ class Compensated:
         outside: how many are outside the domain.
         damped: how many have a damped command.
         fallback: how many violate the limits of the model's card; `first` names the first.
+        lost: which were left out, since the machine does not reach their pose, in words; empty without any.
         branch: how the branch of an arm was chosen, where that was left open.
     """
 
     rows: int = 0
+    lost: str = ""
     outside: int = 0
     damped: int = 0
     fallback: int = 0
@@ -80,7 +83,8 @@ def compensate_table(
         allow_code, tool, base: as of `WantedPoses`.
 
     Returns:
-        Sentences on what was written; and one on rows in which the model violates the limits in its card, else empty.
+        Sentences on what was written; and one on rows that were left out, or in which the model violates the limits in
+        its card, else empty.
 
     Raises:
         InputError: a file cannot be read or is not in this form; nothing is written then.
@@ -92,12 +96,12 @@ def compensate_table(
         poses = WantedPoses(loaded, allow_code, tool, base)
     found = write_compensated(loaded, input, output, poses, back, sd, allow_code=allow_code)
     said = sentences(output, found, loaded)
-    refused = (
+    violates = (
         f"{output}: in {found.fallback} of {found.rows} rows, the first from {found.first} of {input}, {loaded.path} "
         "violates the limits in its card (finite numbers, |deviation| within the limit); they were written without any "
         "correction and with inside_domain = 0: do not use this model"
     )
-    return said, refused if found.fallback else ""
+    return said, "; ".join(filter(None, [found.lost, violates if found.fallback else ""]))
 
 
 def write_compensated(
@@ -126,6 +130,11 @@ def write_compensated(
             shown = counted if counted is not None and (counted.is_in(original.names, table) or not own) else None
             joints, units = poses.joints(table, shown) if poses is not None else _joints(loaded, table, back, shown)
             covariates = stack_columns(table, loaded.covariates) if loaded.covariates else None
+            columns = {original.header(n): original.cells(n) for n in original.names}
+            there = np.asarray(np.isfinite(joints).all(-1))
+            if not there.all():
+                joints, covariates = joints[there], None if covariates is None else covariates[there]
+                columns = {header: [*compress(cells, there)] for header, cells in columns.items()}
             with warnings.catch_warnings():
                 # Reported at the end, with the line of the table.
                 warnings.simplefilter("ignore", FallbackWarning)
@@ -138,8 +147,17 @@ def write_compensated(
             if poses is not None:
                 added |= poses.commanded(found["command"])
             names = {header.partition("[")[0] for header in added}
-            write({original.header(n): original.cells(n) for n in original.names if n not in names} | added)
-            _count(result, table, found, back)
+            write({header: cells for header, cells in columns.items() if header.partition("[")[0] not in names} | added)
+            _count(result, table, np.flatnonzero(there), found, back)
+        if poses is not None and poses.lost:
+            hint = f", or give guess_{loaded.joints[0].header}… near the solution" if poses.chooses else ""
+            result.lost = (
+                f"{input}: no joints of {loaded.facts['mechanism']['name']} were found for the pose at {poses.lost}; "
+                f"{output} has the other {result.rows} rows: correct these poses{hint}"
+            )
+            if not result.rows:
+                # Then nothing is written.
+                raise InputError(result.lost)
     if poses is not None and poses.chooses:
         result.branch = poses.sentence
     return result
@@ -196,11 +214,11 @@ def _added(
     return added | (named("deviation_sd", found["deviation_sd"]) if sd else {})
 
 
-def _count(result: Compensated, table: Table, found: dict[str, Array], back: bool) -> None:
+def _count(result: Compensated, table: Table, rows: NDArray[np.int64], found: dict[str, Array], back: bool) -> None:
     bad = np.flatnonzero(found["fallback"])
     if len(bad) and not result.fallback:
-        result.first = table.name_rows(bad[:1])
-    result.rows += len(table)
+        result.first = table.name_rows(rows[bad[:1]])
+    result.rows += len(rows)
     result.fallback += len(bad)
     result.outside += int((~found["ideal_inside_domain" if back else "inside_domain"]).sum())
     result.damped += int((found["ideal_status" if back else "status"] == DAMPED).sum())

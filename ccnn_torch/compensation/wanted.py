@@ -33,6 +33,7 @@ class WantedPoses:
     Attributes:
         chooses: whether joints were found without a given branch, where there are several.
         goals: whether poses are as the controller has them, `goal_x` …, not as they are measured.
+        lost: the first rows whose pose is not reached, by line, and why; empty without any.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class WantedPoses:
             self._behind_pose = torch.linalg.inv(frames_of(wanted)) @ frames_of(measured)
         self._first, self._region = torch.from_numpy(loaded.middle), torch.from_numpy(loaded.region)
         self._before: Tensor | None = None
-        self.chooses, self.goals = False, goals
+        self.chooses, self.goals, self.lost = False, goals, ""
         self._form: str | None = None
         self._of_pose: dict[str, str] = {}
 
@@ -90,8 +91,10 @@ class WantedPoses:
     def joints(self, table: Table, shown: JointMap | None = None) -> tuple[NDArray[np.float64], dict[str, str]]:
         """Ideal joints of wanted poses, `rows x n` [SI], and the unit to write each in; guesses are as `shown`.
 
+        Joints of poses that the machine does not reach are NaN; `lost` names the first of them.
+
         Raises:
-            InputError: a column is missing, or poses cannot be reached (named by line).
+            InputError: a column is missing.
         """
         mechanism, within = self._mechanism, ROUNDED if self.goals else EXACT
         if self.goals:
@@ -122,12 +125,11 @@ class WantedPoses:
             joints = mechanism.solve_inverse(poses, guess=guess)
         # Of all full turns of a revolute joint the one nearest to the guess, or to the first one.
         joints = nearest_turns(mechanism, joints, guess)
-        lost = np.flatnonzero(~arrives(mechanism, joints, poses, within).numpy())
-        if len(lost):
-            raise InputError(
-                f"{table.path}: no joints of {mechanism.name} were found for the pose at {table.name_rows(lost)}; "
-                f"correct or remove it, or give guess_q1[{mechanism.joints[0].unit}]… near the solution"
-            )
+        there = arrives(mechanism, joints, poses, within)
+        joints = torch.where(there[:, None], joints, torch.nan)
+        lost = np.flatnonzero(~there.numpy())
+        if len(lost) and not self.lost:
+            self.lost = table.name_rows(lost) + self._beyond(mechanism, poses[lost[0]])
         units = {g.name: table.units[g.name] for g in guesses} if guided else self._of_pose
         keys = [g.name if guided else c.unit for g, c in zip(guesses, mechanism.joints, strict=True)]
         return joints.detach().numpy(), {
@@ -153,6 +155,19 @@ class WantedPoses:
         shown = {name: self._of_pose.get(unit, unit) for name, unit in units.items()}
         return {f"command_{n}[{shown[n]}]": from_si(values, units[n], shown[n]) for n, values in columns.items()}
 
+    def _beyond(self, mechanism: Mechanism, pose: Tensor) -> str:
+        """The coordinate that is farthest beyond the poses of the region, and these; empty where none is."""
+        poses = mechanism.forward_kinematics(_all_over(self._region))
+        low, high = poses.nan_to_num(nan=torch.inf).amin(0), poses.nan_to_num(nan=-torch.inf).amax(0)
+        out = torch.maximum(pose - high, low - pose) / (high - low).clamp_min(1e-12)
+        k = int(out.argmax())
+        if not out[k] > 0:
+            return ""
+        unit = mechanism.pose[k].unit
+        shown = self._of_pose.get(unit, unit)
+        value, least, most = (f"{float(from_si(v[k].item(), unit, shown)):.4g}" for v in (pose, low, high))
+        return f" ({mechanism.pose[k].name} = {value} {shown}; in the model's region {least} to {most} {shown})"
+
     def _of_the_measured_tool(self, poses: Tensor) -> Tensor:
         """Poses of the tool and in the frame with which the model was made, `s x p`."""
         if self._same:
@@ -176,11 +191,15 @@ def _units(table: Table, read: Sequence[str]) -> dict[str, str]:
 
 def nearest_measured(mechanism: Mechanism, region: Tensor, pose: Tensor) -> Tensor:
     """Joints in the region, lowest and highest `n x 2`, whose pose is among the nearest to one, `n` [SI]."""
-    share = torch.rand(_LOOKED_AT, len(region), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    joints = region[:, 0] + (region[:, 1] - region[:, 0]) * share
+    joints = _all_over(region)
     error = mechanism.pose_error(mechanism.forward_kinematics(joints), pose)
     turned = 0.0 if error.rotation is None else ROTATION_WEIGHT * error.rotation
     return joints[torch.nan_to_num(error.position + turned, nan=torch.inf).argmin()]
+
+
+def _all_over(region: Tensor) -> Tensor:
+    share = torch.rand(_LOOKED_AT, len(region), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return region[:, 0] + (region[:, 1] - region[:, 0]) * share
 
 
 def nearest_turns(mechanism: Mechanism, joints: Tensor, guess: Tensor) -> Tensor:

@@ -59,6 +59,8 @@ class FoundMachine(NamedTuple):
         covariates: those without which the effects change.
         edges: lowest and highest of each, `m x 2` [SI].
         columns, joint_map: as the records had them.
+        beside: lowest and highest joints of the records, `n x 2` [SI], of a machine that holds all over its workspace,
+            which has no `joints`; none where these are not known.
     """
 
     nominal: Mechanism
@@ -70,6 +72,7 @@ class FoundMachine(NamedTuple):
     edges: Tensor
     columns: dict[str, str]
     joint_map: dict[str, str]
+    beside: Tensor = torch.zeros(0, 2, dtype=torch.float64)
 
     @property
     def identified(self) -> Mechanism:

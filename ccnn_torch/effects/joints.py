@@ -158,7 +158,8 @@ class Transmission(OfJoints):
         The drives of a machine's legs are made alike.
         """
         (low, high), rows = situation.workspace, situation.joints.flatten(0, -2)
-        measured = (rows.amax(0) - rows.amin(0)).nan_to_num(0.0)
+        # A joint that is not known in some rows travels as far as in the others.
+        measured = rows.nan_to_num(nan=-torch.inf).amax(0) - rows.nan_to_num(nan=torch.inf).amin(0)
         travels = torch.maximum(measured, _LEAST_TRAVEL * (high - low)).tolist()
         joints, count = situation.mechanism.joints, len(_HARMONICS)
         alike = any(p.leg is not None for p in situation.mechanism.geometry)

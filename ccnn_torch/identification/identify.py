@@ -221,7 +221,11 @@ def write_outputs(found: Identification, folder: Path) -> None:
     save_tensors(folder / ARRAYS_FILE, found.arrays)
     # Of several machines the first.
     config = found.config
-    write_machine(found.mechanism(), found.nominal(), folder, "identified", config.columns, config.joint_map)
+    machine, measured = found.mechanism(), found.measured
+    joints = torch.cat([measured.rows.joints[0], measured.test.joints[0]])
+    ends = torch.stack([joints.amin(0), joints.amax(0)], -1).tolist()
+    maps = config.columns, config.joint_map, {j.name: pair for j, pair in zip(machine.joints, ends, strict=False)}
+    write_machine(machine, found.nominal(), folder, "identified", *maps)
     if found.config.save_report:
         write_identified_report(folder, results)
     write_json(folder / RESULTS, IdentifiedResults.model_validate(results))

@@ -7,13 +7,14 @@ parameters:
   …
 columns: {A1: "q1[deg]"}   # where the records had other headers
 joint_map: {q3: "J3 - J2"}   # where the controller counts its joints otherwise
+measured: {q1: [0.2, 1.4]}   # lowest and highest joints of its records [SI]
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
@@ -35,7 +36,7 @@ _FORM = "a mechanism file has mechanism, keys and parameters: {NAME: {value: …
 
 
 class MechanismFile:
-    """A mechanism file: `spec` and `keys` build the mechanism; `columns`, `joint_map` are as its records had them."""
+    """A mechanism file: `spec` and `keys` build the mechanism; the rest is of its records."""
 
     def __init__(self, path: str, content: Mapping[str, Any]) -> None:
         """Check the form; names and units are checked against the mechanism by `parameters_of`."""
@@ -48,6 +49,12 @@ class MechanismFile:
             if not isinstance(found, Mapping) or not all(isinstance(v, str) for pair in found.items() for v in pair):
                 raise InputError(f"{path}: {key}: must map texts to texts, e.g. {{{example}}}")
         self.columns, self.joint_map = (dict(found) for found in maps)
+        self.measured = content.get("measured") or {}
+        ends = self.measured.values() if isinstance(self.measured, Mapping) else [None]
+        if not all(isinstance(pair, list) and len(pair) == 2 and all(map(_is_number, pair)) for pair in ends):
+            raise InputError(
+                f"{path}: measured: must map joints to their lowest and highest number, e.g. {{q1: [0, 1]}}"
+            )
         self.spec, self.keys = spec, dict(keys)
         self._entries: Mapping[str, Any] = parameters
 
@@ -63,13 +70,17 @@ class MechanismFile:
         for name, unit in known.items():
             entry = self._entries[name]
             value = entry.get(what) if isinstance(entry, Mapping) else None
-            if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+            if not _is_number(value):
                 shown = visible(repr(value))
                 raise InputError(f"{self.path}: parameters.{name}.{what}: must be a finite number, not {shown}")
             if entry.get("unit") != unit:
                 raise InputError(f"{self.path}: parameters.{name}.unit: must be {unit}, not {entry.get('unit')!r}")
             found[name] = float(value)
         return found
+
+
+def _is_number(value: Any) -> TypeGuard[float]:
+    return not isinstance(value, bool) and isinstance(value, int | float) and abs(value) <= LARGEST
 
 
 def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFile | None:
@@ -90,6 +101,7 @@ def mechanism_text(
     nominal: Mapping[str, float],
     columns: Mapping[str, str] | None = None,
     joint_map: Mapping[str, str] | None = None,
+    measured: Mapping[str, Sequence[float]] | None = None,
 ) -> str:
     """A mechanism file's text; `load_mechanism` of it gives the same mechanism with the same parameters, bit by bit.
 
@@ -97,6 +109,7 @@ def mechanism_text(
         nominal: what was there before, by name [SI].
         columns: the headers that its records mapped.
         joint_map: the joints as sums of its records' columns.
+        measured: lowest and highest joint of its records, by name [SI].
     """
     about = mechanism.describe()
     tree = {
@@ -108,6 +121,7 @@ def mechanism_text(
         },
         **({"columns": dict(columns)} if columns else {}),
         **({"joint_map": dict(joint_map)} if joint_map else {}),
+        **({"measured": {name: list(pair) for name, pair in measured.items()}} if measured else {}),
     }
     return dump_yaml(tree, width=120)
 
@@ -242,6 +256,7 @@ def write_machine(
     stem: str,
     columns: Mapping[str, str] | None = None,
     joint_map: Mapping[str, str] | None = None,
+    measured: Mapping[str, Sequence[float]] | None = None,
 ) -> list[Path]:
     """Write `STEM.yaml`, of a serial arm also `STEM.urdf` and, where it is one of DH parameters, `STEM_dh.yaml`.
 
@@ -252,10 +267,9 @@ def write_machine(
         nominal: what was there before, by name [SI].
         folder: where to.
         stem: of the files' names.
-        columns: the headers that its records mapped.
-        joint_map: the joints as sums of its records' columns.
+        columns, joint_map, measured: as of `mechanism_text`.
     """
-    texts = {f"{stem}.yaml": mechanism_text(mechanism, nominal, columns, joint_map)}
+    texts = {f"{stem}.yaml": mechanism_text(mechanism, nominal, columns, joint_map, measured)}
     # A URDF has no word for what a drive moves beside its joint, or too far.
     if isinstance(mechanism, SerialArm) and not mechanism.drives:
         texts[f"{stem}.urdf"] = urdf_text(mechanism)

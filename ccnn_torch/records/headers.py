@@ -376,17 +376,24 @@ def check_orientation(table: Table, mechanism: HasCoordinates, unused: Iterable[
     if not any(coordinate.name in ROTATION_VECTOR for coordinate in mechanism.pose):
         return
     folded = {_folded(name): name for name in unused if _may_be_angle(table.units[name])}
-    together = next((letters for letters in _TOGETHER if all(letter in folded for letter in letters)), ())
-    found = [folded[letter] for letter in together] or [name for key, name in folded.items() if _TURN.fullmatch(key)]
+    groups = [(letters, [folded[one] for one in letters if one in folded]) for letters in _TOGETHER]
+    together, found = next(((letters, names) for letters, names in groups if len(names) == 3), ((), []))
+    found = found or [name for key, name in folded.items() if _TURN.fullmatch(key)]
     matrix = [name for key, name in folded.items() if _MATRIX.fullmatch(key)]
     turned = not found and len(matrix) >= 9
     found = matrix if turned else found
     if not found:
+        # Two letters are an orientation where they are angles, and known to be a controller's.
+        pairs = (one for one in groups if len(one[1]) == 2 and _TOGETHER[one[0]])
+        together, found = next((one for one in pairs if not {table.units[n] for n in one[1]} & {"", "1"}), ((), []))
+    if not found:
         return
     meant = _TOGETHER.get(together) if together else None
-    if meant is not None:
-        pairs = (f'"{table.header(n)}": "{m}[{table.units[n] or "deg"}]"' for n, m in zip(found, meant, strict=True))
-        say = f"write columns: {{{', '.join(pairs)}}} if they are"
+    if meant is not None and len(found) < 3:
+        say = f"one of three angles is missing: give all of {', '.join(meant)}"
+    elif meant is not None:
+        entries = (f'"{table.header(n)}": "{m}[{table.units[n] or "deg"}]"' for n, m in zip(found, meant, strict=True))
+        say = f"write columns: {{{', '.join(entries)}}} if they are"
     elif turned:
         say = f"a matrix is not read, give the quaternion {', '.join(_QUATERNION)} (scipy: Rotation.from_matrix)"
     else:

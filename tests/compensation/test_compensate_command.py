@@ -144,8 +144,11 @@ def test_poses_of_the_tripod(folder: Path, tmp_path: Path, tripod: Compensator) 
     np.testing.assert_allclose(command, expected, rtol=1e-14)
     table["z[m]"][4] = 2.0
     write_table(tmp_path / "in.csv", table)
-    with pytest.raises(InputError, match=r"in\.csv: no joints of tripod were found for the pose at line 6 \(row 5\)"):
+    reason = r"in\.csv: no joints of tripod were found for the pose at line 6 \(row 5\) \(z = 2 m; .* other 29 rows"
+    with pytest.raises(InputError, match=reason):
         compensate(folder / "model.onnx", tmp_path / "in.csv", tmp_path / "out.csv", pose=True)
+    reached = columns(tmp_path / "out.csv", "command_q1", "command_q2", "command_q3")
+    np.testing.assert_array_equal(reached, np.delete(command, 4, 0))
 
 
 @pytest.fixture

@@ -327,7 +327,10 @@ def test_a_gears_error_comes_back_after_its_period() -> None:
 @pytest.mark.parametrize(("travel", "lead"), [(1.0, 10e-3), (0.12, 5e-3), (0.12, 2e-3)])
 def test_screws_of_usual_leads_are_looked_for_over_the_travel_of_the_rows(travel: float, lead: float) -> None:
     rows = situation(str(GANTRY))
-    rows = replace(rows, joints=torch.linspace(0.2, 0.2 + travel, 9, dtype=torch.float64)[:, None].expand(9, 3))
+    joints = torch.linspace(0.2, 0.2 + travel, 9, dtype=torch.float64)[:, None].repeat(1, 3)
+    # A row whose joints are not known.
+    joints[4] = torch.nan
+    rows = replace(rows, joints=joints)
     grid = torch.tensor(make_effect("transmission").shapes(rows)[0].grid)
     # A wave between two neighbours of the grid is seen by both.
     assert float((grid - 2 * math.pi / lead).abs().min()) < 2 * math.pi / travel / 4

@@ -6,6 +6,7 @@ import pytest
 import torch
 from mechanisms.catalogue import make
 
+from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.mechanisms.mechanism_file import dh_text, mechanism_text, read_mechanism_file, urdf_text
@@ -32,6 +33,18 @@ def test_own_file_gives_the_same_parameters_bit_by_bit(name: str, tmp_path: Path
     file = read_mechanism_file(str(path))
     assert file is not None
     assert file.parameters_of(again, "nominal") == nominal
+
+
+def test_where_rows_were_measured_is_inside_the_domain_of_what_they_identified(tmp_path: Path) -> None:
+    machine, path = load_mechanism("delta"), tmp_path / "identified.yaml"
+    nominal = dict(zip((p.name for p in machine.geometry), machine.nominal.tolist(), strict=True))
+    lower = [[1.29, 1.3, 1.31]]
+    for measured, inside in (({}, False), ({j.name: [1.2, 1.4] for j in machine.joints}, True)):
+        path.write_text(mechanism_text(changed(machine), nominal, measured=measured))
+        assert load_compensation(path)(lower, ways=("command",))["inside_domain"].tolist() == [inside]
+    path.write_text(path.read_text().replace("1.2", "low"))
+    with pytest.raises(InputError, match="measured: must map joints to their lowest and highest number"):
+        read_mechanism_file(str(path), path.read_bytes())
 
 
 @pytest.mark.parametrize("name", ARMS)

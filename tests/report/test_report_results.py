@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from frozen import frozen
 from jsonschema import Draft202012Validator
 from sklearn.metrics import mean_absolute_error, mean_squared_error
 
+from ccnn_torch.calibration import result
 from ccnn_torch.calibration.page import paper_case
 from ccnn_torch.calibration.statistics import (
     before_block,
@@ -26,6 +28,7 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import plain, read_json, write_json
 from ccnn_torch.report.results.run import KnownEffects, RunResults
+from ccnn_torch.version import __version__
 
 JOINTS = (Coordinate("q1", "m"), Coordinate("q2", "m"), Coordinate("q3", "m"))
 
@@ -237,3 +240,13 @@ def test_a_result_is_read_back_as_it_was_written_or_refused(tmp_path: Path, resu
     write_json(path, plain(results) | {"seed": "first"})
     with pytest.raises(InputError, match=r"results\.json: is no results\.json of this version: seed: "):
         RunResults.read(path)
+
+
+def test_versions_are_told_of_a_checkout_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def installed(name: str) -> str:
+        if name == "ccnn-torch":
+            raise PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(result, "version", installed)
+    assert result.versions()["ccnn-torch"] == __version__

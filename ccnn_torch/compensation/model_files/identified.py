@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.fit import ROWS, all_over, machine_alone
+from ccnn_torch.compensation.fit import machine_alone, rows_of
 from ccnn_torch.compensation.model_files.load import MACHINE_FORMS, LoadedModel, load_compensation, read_model
 from ccnn_torch.compensation.model_files.metadata import card_of, from_json
 from ccnn_torch.compensation.model_files.signature import check_signature, sign_content, signature_path
@@ -26,9 +26,9 @@ def model_of_machine(path: Path, machine: FoundMachine, signed: bool = False) ->
 
     def made() -> Compensator:
         try:
-            if not len(machine.joints):
-                return machine_alone(all_over(nominal), machine.values, margin=0.0)
-            return machine_alone(machine.rows(ROWS), machine.values, machine.acting, machine.covariates)
+            # The workspace has its own ends, records have not.
+            margin = {} if len(machine.joints) or len(machine.beside) else {"margin": 0.0}
+            return machine_alone(rows_of(machine), machine.values, machine.acting, machine.covariates, **margin)
         except (InputError, MethodFailedError) as reason:
             raise ModelFileError(f"{path}: {reason}") from None
 
@@ -53,7 +53,9 @@ def load_geometry(path: str | Path, *, public_key: str | Path | None = None, all
     # Commands are of the machine, whatever it was seen through.
     nominal, identified = (inside(mechanism_of_file(file, what, allow_code)) for what in ("nominal", "value"))
     none = torch.zeros(0, 2, dtype=torch.float64)
-    about = (default_gravity(nominal), none, (), none, file.columns, file.joint_map)
+    ends = [file.measured[j.name] for j in nominal.joints if j.name in file.measured]
+    beside = torch.tensor(ends, dtype=torch.float64) if len(ends) == len(nominal.joints) else none
+    about = (default_gravity(nominal), none, (), none, file.columns, file.joint_map, beside)
     machine = FoundMachine(nominal, identified.nominal, [], *about)
     return model_of_machine(path, machine, public_key is not None)
 

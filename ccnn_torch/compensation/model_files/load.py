@@ -341,9 +341,9 @@ class LoadedModel:
         if not len(measured):
             import torch
 
-            from ccnn_torch.compensation.fit import all_over
+            from ccnn_torch.compensation.fit import rows_of
 
-            joints = all_over(self.machine.nominal).joints
+            joints = rows_of(self.machine).joints
             fine = joints[torch.isfinite(joints).all(-1)]
             measured = torch.stack([fine.amin(0), fine.amax(0)], -1)
         region: Array = measured.numpy()

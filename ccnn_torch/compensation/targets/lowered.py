@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.compensation.fit import ROWS, all_over
+from ccnn_torch.compensation.fit import ROWS, rows_of
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.display import number_text, plain
 from ccnn_torch.effects import Situation, measured_pose, reached
@@ -68,7 +68,7 @@ class Found:
         """Commanded joints and covariates, `s x n`, of which all have a pose."""
         machine = self.model.machine
         if machine is not None:
-            rows = machine.rows(ROWS) if len(machine.joints) else all_over(machine.nominal)
+            rows = rows_of(machine)
         else:
             low, high = torch.from_numpy(self.model.region).unbind(-1)
             share = torch.rand(ROWS, len(low), generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.residual.distance import USUAL, Size, distance, size_of
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.display import number_text
@@ -126,6 +127,15 @@ _ALIKE = 1.2
 # Distance in sizes of the machine that a row without a pose counts as.
 _UNREACHED = 10.0
 _TURN = 180 / torch.pi
+# What values are to be multiplied by that were taken for another unit.
+_LENGTHS = {
+    "millimetres under m": 1e-3,
+    "centimetres under m": 1e-2,
+    "inches under m": 0.0254,
+    "inches under mm": 25.4,
+    "metres under mm, or the model in millimetres under m": 1e3,
+}
+_ANGLES = {"degrees under rad": 1 / _TURN, "radians under deg": _TURN}
 _POSE = ("x", "y", "z", "rx", "ry", "rz")
 # Share of the usual distance that a fitted frame may leave.
 _LEFT = 0.1
@@ -194,24 +204,12 @@ def _of_pose(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Situ
     """In the measured pose."""
     pose = situation.mechanism.pose
     lengths = torch.tensor([c.unit == "m" for c in pose])
-    for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
-        corrected = torch.where(lengths, factor * measured, measured)
-        yield f"the pose's lengths seem to be in {unit} under m", situation, corrected
-    words = (
-        "the records' lengths are about 1000 times smaller than the model's: metres under mm, or a model in millimetres"
-    )
-    yield words, situation, torch.where(lengths, 1e3 * measured, measured)
-    for i, one in enumerate(pose):
-        if one.unit == "m":
-            factors = torch.ones(len(pose), dtype=measured.dtype)
-            factors[i] = 1e-3
-            yield f"{one.name} of the pose seems to be in millimetres under m", situation, measured * factors
+    for words, factors in _other_units("the pose's ", " of the pose", pose):
+        yield words, situation, factors * measured
     shift = torch.where(lengths, torch.nan_to_num((measured - situation.pose).nanmedian(0).values), 0.0)
     far = ", ".join(f"{c.name} by {float(v):.4g} m" for c, v in zip(pose, shift, strict=True) if c.unit == "m")
     words = f"the frame that the pose is given in seems to be shifted ({far}): give the pose in the model's base frame"
     yield words, situation, measured - shift
-    turned = torch.where(lengths, measured, measured / _TURN)
-    yield "the pose's angles seem to be in degrees under rad", situation, turned
     yield from _orientations(situation, measured)
     for i, one in enumerate(pose):
         yield f"{one.name} of the pose seems to be reversed", situation, _reversed(measured, i)
@@ -239,13 +237,20 @@ def _of_model_and_joints(
     for i, joint in enumerate(joints):
         words = f"joint {joint.name} seems to count in the other direction"
         yield words, replace(situation, joints=_reversed(at, i)), measured
-    angles = torch.tensor([j.unit == "rad" for j in joints])
-    for factor, words in ((1 / _TURN, "degrees under rad"), (_TURN, "radians under deg")):
-        scaled = torch.where(angles, factor * at, at)
-        yield f"the joints seem to be in {words}", replace(situation, joints=scaled), measured
-    for factor, words in ((1e-3, "millimetres under m"), (1e3, "metres under mm")):
-        scaled = torch.where(angles, at, factor * at)
-        yield f"the joints seem to be in {words}", replace(situation, joints=scaled), measured
+    for words, factors in _other_units("the joints' ", "", joints):
+        yield words, replace(situation, joints=factors * at), measured
+
+
+def _other_units(whose: str, of: str, coordinates: Sequence[Coordinate]) -> Iterator[tuple[str, Tensor]]:
+    """Units that may have been meant, in words, and what values are to be multiplied by: all of a kind, or one."""
+    for unit, kind, others in (("m", "lengths", _LENGTHS), ("rad", "angles", _ANGLES)):
+        own = torch.tensor([c.unit == unit for c in coordinates])
+        for words, factor in others.items():
+            yield f"{whose}{kind} seem to be in {words}", torch.where(own, factor, 1.0).double()
+            for i in torch.nonzero(own)[:, 0].tolist() if int(own.sum()) > 1 else ():
+                one = torch.ones(len(own), dtype=torch.float64)
+                one[i] = factor
+                yield f"{coordinates[i].name}{of} seems to be in {words.partition(',')[0]}", one
 
 
 def _orientations(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Situation, Tensor]]:
