@@ -73,8 +73,12 @@ def drivers_of(problem: Problem, axis: int, moved: Tensor) -> list[Driver]:
         warm = (problem.driven.warm / warmest).expand_as(moved)[None]
         direct["temperature"] = lambda: warm
         pushed.append(("temperature", lambda: warm * sign))
+
+    def sized(made: Callable[[], Tensor]) -> Callable[[], Tensor]:
+        return lambda: _SIZE * span * made()
+
     both = [*((name, made, False) for name, made in direct.items()), *((name, made, True) for name, made in pushed)]
-    return [Driver(name, lambda made=made: _SIZE * span * made(), is_torque) for name, made, is_torque in both]
+    return [Driver(name, sized(made), is_torque) for name, made, is_torque in both]
 
 
 def done(problem: Problem, theta: Tensor, axis: int, moved: Tensor, torques: Tensor) -> Tensor:

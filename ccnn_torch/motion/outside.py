@@ -164,12 +164,12 @@ def _beside(
     low, high = (ends[axis, flat] for ends in problem.library.bounds)
     # A number at an end of what it may be stays there.
     free = (theta[flat] > low) & (theta[flat] < high)
-    drivers, rows = _changes(problem, axis, spec, tried, push, moved)
+    drivers, changes = _changes(problem, axis, spec, tried, push, moved)
     parts, views = [1, len(flat), *(len(columns) for _, columns in drivers.values())], []
-    parts.append(len(rows) - sum(parts))
+    parts.append(len(changes) - sum(parts))
     # Whitened, and the position itself.
     for whitening in (found.whitening, white_noise(len(problem.axes))):
-        white = problem.whitened(rows, torch.tensor([axis]).expand(len(rows)), whitening)
+        white = problem.whitened(changes, torch.tensor([axis]).expand(len(changes)), whitening)
         residual, own, *each, in_place = torch.split(white, parts)
         own = own * free[:, None]
         views.append((residual[0] + theta[flat] @ own + in_place.sum(0), own, each))

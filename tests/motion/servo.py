@@ -30,7 +30,8 @@ def command(kind: int, time: Array) -> Array:
 
 def between(time: Array, values: Array) -> Callable[[float], float]:
     """Values on straight lines between samples: of one number numpy.interp takes many times as long."""
-    times, known = time.tolist(), values.tolist()
+    times: list[float] = time.tolist()
+    known: list[float] = values.tolist()
 
     def value(t: float) -> float:
         k = min(max(bisect(times, t), 1), len(times) - 1)

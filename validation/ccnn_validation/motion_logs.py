@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from itertools import permutations
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +25,9 @@ from numpy.typing import NDArray
 from ccnn_validation.delivered.product import Contestant
 
 try:
-    from numba import njit
+    import numba
 except ImportError:
-
-    def njit(function: Any) -> Any:
-        """The function itself."""
-        return function
-
+    numba = None  # type: ignore[assignment]
 
 Array = NDArray[np.float64]
 STEP, SAMPLES, ENCODER = 1e-4, 500, 2 * np.pi / 16384
@@ -71,8 +67,7 @@ BESIDE_ROOT = frozenset({"coulomb", "viscous", "stribeck"})
 LAGS, LAGS_OR_INERTIA = ("servo_gain", "viscous", "delay"), ("inertia", "delay")
 
 
-@njit
-def course(time: Array, asked: Array, count: int, late: float, order: float, values: Array) -> Array:
+def _course(time: Array, asked: Array, count: int, late: float, order: float, values: Array) -> Array:
     """Positions at each step; values: as in `PARAMETERS`."""
     gain, inertia, damping, dry, sine, cosine, cube, twice, phase, faster, root, teeth = values
     q, v, k, found = asked[0], 0.0, 0, np.empty(count)
@@ -92,6 +87,9 @@ def course(time: Array, asked: Array, count: int, late: float, order: float, val
     return found
 
 
+course = cast(Callable[..., Array], _course if numba is None else numba.njit(_course))
+
+
 def command(kind: int, rng: np.random.Generator) -> Callable[[Array], Array]:
     """Two sines, a triangle, or a chirp."""
     rate, size = rng.uniform(0.85, 1.2), rng.uniform(0.8, 1.0)
@@ -105,6 +103,29 @@ def command(kind: int, rng: np.random.Generator) -> Callable[[Array], Array]:
         * size
         * (0.8 * np.sin(1.3 * rate * t) + 0.25 * np.sin(turns * (0.3 * t + 0.18 * rate * t**2)))
     )
+
+
+Values = dict[str, float]
+CAUSES: dict[str, Callable[[Values, float, np.random.Generator], Values]] = {
+    "none": lambda real, size, rng: {},
+    "q3": lambda real, size, rng: {"cube": 0.15 * size * real["gain"]},
+    "sin2q": lambda real, size, rng: {"twice": 0.06 * size * real["gain"], "phase": rng.uniform(0, 6.28)},
+    "v3": lambda real, size, rng: {"faster": 0.006 * size * real["gain"]},
+    "root": lambda real, size, rng: {"root": 0.03 * size * real["gain"]},
+    "gravity": lambda real, size, rng: {
+        "sine": 0.08 * size * real["gain"],
+        "cosine": 0.02 * real["gain"] * rng.uniform(-1, 1),
+    },
+    "coulomb": lambda real, size, rng: {"dry": 0.02 * size * real["gain"]},
+    "backlash": lambda real, size, rng: {"play": 0.03 * size},
+    "servo_gain": lambda real, size, rng: {"gain": real["gain"] * np.exp(rng.choice([-1, 1]) * 0.3 * size)},
+    "viscous": lambda real, size, rng: {"damping": real["damping"] * (1 + 0.4 * size)},
+    "inertia": lambda real, size, rng: {"inertia": real["inertia"] * (1 + 0.6 * size)},
+    "cogging": lambda real, size, rng: {"teeth": 0.02 * size * real["gain"], "order": float(rng.integers(8, 20))},
+    "delay": lambda real, size, rng: {"delay": 0.02 * size},
+    "offset": lambda real, size, rng: {"offset": 0.02 * size * rng.choice([-1, 1])},
+}
+"""What a cause of a size changes of an axis."""
 
 
 def drawn(family: str, seed: int) -> tuple[dict[str, float], str]:
@@ -122,23 +143,7 @@ def drawn(family: str, seed: int) -> tuple[dict[str, float], str]:
     beside = {"delay": 0.0, "order": 1.0, "play": 0.0, "offset": 0.0}
     for cause in family.removeprefix("free:").split("+"):
         size = rng.uniform(0.6, 1.4)
-        changes: dict[str, Callable[[], dict[str, float]]] = {
-            "q3": lambda size=size: {"cube": 0.15 * size * gain},
-            "sin2q": lambda size=size: {"twice": 0.06 * size * gain, "phase": rng.uniform(0, 6.28)},
-            "v3": lambda size=size: {"faster": 0.006 * size * gain},
-            "root": lambda size=size: {"root": 0.03 * size * gain},
-            "gravity": lambda size=size: {"sine": 0.08 * size * gain, "cosine": 0.02 * gain * rng.uniform(-1, 1)},
-            "coulomb": lambda size=size: {"dry": 0.02 * size * gain},
-            "backlash": lambda size=size: {"play": 0.03 * size},
-            "servo_gain": lambda size=size: {"gain": gain * np.exp(rng.choice([-1, 1]) * 0.3 * size)},
-            "viscous": lambda size=size: {"damping": damping * (1 + 0.4 * size)},
-            "inertia": lambda size=size: {"inertia": inertia * (1 + 0.6 * size)},
-            "cogging": lambda size=size: {"teeth": 0.02 * size * gain, "order": float(rng.integers(8, 20))},
-            "delay": lambda size=size: {"delay": 0.02 * size},
-            "offset": lambda size=size: {"offset": 0.02 * size * rng.choice([-1, 1])},
-            "none": dict,
-        }
-        for name, value in changes[cause]().items():
+        for name, value in CAUSES[cause](real, size, rng).items():
             (real if name in real else beside)[name] = value
     lines = ["time[s],run[1],command1[rad],q1[rad]"]
     for run in range(3):
