@@ -30,7 +30,7 @@ from ccnn_torch.motion.stretches import PLACES, START
 
 Array = NDArray[np.float64]
 # Steps longer than this, in units of the axis' own time constant, are divided.
-_LONGEST, _MOST_PARTS = 0.3, 8
+_LONGEST, _MOST_PARTS = 0.15, 8
 
 
 class Drive(NamedTuple):

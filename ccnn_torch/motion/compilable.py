@@ -55,6 +55,15 @@ if numba is not None:
     overload(pick)(lambda which, a, b: lambda which, a, b: a if which else b)
 
 
+def some(which: Any) -> Any:
+    """Whether that is true, of an array anywhere."""
+    return np.any(which)
+
+
+if numba is not None:
+    overload(some)(lambda which: lambda which: which)
+
+
 def fixed_tuple(values: Any, count: int) -> tuple[Any, ...]:
     """The first `count` values; compiled, their number is a constant."""
     return tuple(values[:count])

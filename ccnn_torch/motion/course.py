@@ -129,7 +129,9 @@ def _bend(u: Array, k: int) -> Array:
     last = len(u) - 3
     i, j = min(max(k - 1, 0), last), min(k, last)
     a, b = (u[i + 2] - u[i + 1]) - (u[i + 1] - u[i]), (u[j + 2] - u[j + 1]) - (u[j + 1] - u[j])
-    found: Array = pick(a * b > 0, -0.5 * np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0.0 * a)
+    # The mean of both curvatures, at most twice the smaller one (van Leer 1977).
+    least = np.minimum(np.abs(a), np.abs(b))
+    found: Array = pick(a * b > 0, -0.5 * np.sign(a) * np.minimum(np.abs(a + b) / 2, 2 * least), 0.0 * a)
     return found
 
 

@@ -14,8 +14,8 @@ from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.spec import Spec
 from ccnn_torch.motion.whiten import Whitening
 
-# Of a difference quotient, in plausible sizes.
-_STEP = 1e-3
+STEP = 1e-3
+"""Of a difference quotient, in plausible sizes."""
 # How often numbers at an end of what they may be are looked for in a step.
 _HELD = 3
 # Shares of a Gauss-Newton step that are tried, the whole one first, and what a step is damped by.
@@ -86,9 +86,9 @@ def _columns(
     if len(which):
         # One row for every number that is moved.
         moved = theta[which]
-        moved[torch.arange(len(which)), torch.tensor([j for own in places for j in own])] += _STEP
+        moved[torch.arange(len(which)), torch.tensor([j for own in places for j in own])] += STEP
         column = torch.cat([torch.arange(int(c)) for c in counts])
-        columns[which, column] = (residual[which] - white_residual(problem, whitening, moved, axis[which])) / _STEP
+        columns[which, column] = (residual[which] - white_residual(problem, whitening, moved, axis[which])) / STEP
     return columns
 
 

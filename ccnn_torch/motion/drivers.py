@@ -3,6 +3,7 @@ simulated position, or a torque that the axis moves under."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -28,16 +29,16 @@ _STEP, _SIZE = 1e-3, 0.05
 
 
 class Driver(NamedTuple):
-    """A driver, its columns `m x b x s` in plausible sizes [rad or m], and whether they are torques over the gain or
-    added to the positions."""
+    """A driver, what makes its columns `m x b x s` in plausible sizes [rad or m], and whether they are torques over the
+    gain or added to the positions."""
 
     name: str
-    columns: Tensor
+    columns: Callable[[], Tensor]
     is_torque: bool
 
 
 def drivers_of(problem: Problem, axis: int, moved: Tensor) -> list[Driver]:
-    """Columns of each driver on a motion of an axis, `b x s`, torques last; of what does not vary they are 0."""
+    """Each driver on a motion of an axis, `b x s`, torques last; columns of what does not vary are 0."""
     data = problem.data
     place, fast = data.position[axis], data.speed[axis]
     speed = _slope(moved, data.time)
@@ -45,35 +46,46 @@ def drivers_of(problem: Problem, axis: int, moved: Tensor) -> list[Driver]:
     # An axis that follows exactly has no torque, and what rounding leaves of it has the sign of the speed.
     span = place.max() - place.min()
     loaded = error.abs().max() > _LOADED * span
-    over, sign = _over_time(problem), direction(speed, speed.abs().mean())
+    sign = direction(speed, speed.abs().mean())
+
+    def of_speed(count: int | None = None) -> Tensor:
+        return _smooth(speed, fast, data.judged, count)
+
+    def of_place(count: int = _EVENLY) -> Tensor:
+        return _smooth(moved, place, data.judged, count)
+
     direct = {
-        "speed": _smooth(speed, fast, data.judged),
-        "acceleration": _smooth(_slope(speed, data.time), None, data.judged),
-        "reversal": _fading(speed, data.time),
-        "position": _smooth(moved, place, data.judged, _EVENLY),
-        "torque": _smooth(error, None, data.judged) * loaded,
+        "speed": of_speed,
+        "acceleration": lambda: _smooth(_slope(speed, data.time), None, data.judged),
+        "reversal": lambda: _fading(speed, data.time),
+        "position": of_place,
+        "torque": lambda: _smooth(error, None, data.judged) * loaded,
         # A constant of its own: what drifts begins somewhere.
-        "time": torch.cat([torch.ones_like(over[:1]), over]),
+        "time": lambda: torch.cat([torch.ones_like(moved)[None], _over_time(problem)]),
     }
     # Friction comes and goes with the place, the time and the temperature as well; what is as smooth as a cubic is told
     # by fewer numbers.
-    pushed = [("speed", direct["speed"]), ("position", direct["position"]), ("position", direct["position"] * sign)]
-    pushed += [("speed", _smooth(speed, fast, data.judged, 2)), ("position", _smooth(moved, place, data.judged, 2))]
-    pushed.append(("time", over * sign))
+    pushed = [("speed", of_speed), ("position", of_place), ("position", lambda: of_place() * sign)]
+    pushed += [("speed", lambda: of_speed(2)), ("position", lambda: of_place(2))]
+    pushed.append(("time", lambda: _over_time(problem) * sign))
     warmest = problem.driven.warm.abs().max()
     if float(warmest) >= _WARMER:
-        direct["temperature"] = (problem.driven.warm / warmest).expand_as(moved)[None]
-        pushed.append(("temperature", direct["temperature"] * sign))
-    both = [*((name, columns, False) for name, columns in direct.items()), *((n, c, True) for n, c in pushed)]
-    return [Driver(name, _SIZE * span * columns, is_torque) for name, columns, is_torque in both]
+        warm = (problem.driven.warm / warmest).expand_as(moved)[None]
+        direct["temperature"] = lambda: warm
+        pushed.append(("temperature", lambda: warm * sign))
+
+    def sized(made: Callable[[], Tensor]) -> Callable[[], Tensor]:
+        return lambda: _SIZE * span * made()
+
+    both = [*((name, made, False) for name, made in direct.items()), *((name, made, True) for name, made in pushed)]
+    return [Driver(name, sized(made), is_torque) for name, made, is_torque in both]
 
 
-def done(problem: Problem, theta: Tensor, axis: int, torques: Tensor) -> Tensor:
-    """What torques `m x b x s` of plausible size do to the positions of an axis with numbers `theta`, `m x b x s`."""
-    mine = torch.tensor([axis])
+def done(problem: Problem, theta: Tensor, axis: int, moved: Tensor, torques: Tensor) -> Tensor:
+    """What torques `m x b x s` of plausible size do to the positions `moved`, `b x s`, of an axis with numbers `theta`,
+    `m x b x s`."""
     every = (torques * (_STEP / _SIZE)).expand(len(problem.axes), *torques.shape)
-    under = problem.pushed(theta[None], mine, every)[0] - problem.positions(theta[None], mine)
-    return under * (_SIZE / _STEP)
+    return (problem.pushed(theta[None], torch.tensor([axis]), every)[0] - moved) * (_SIZE / _STEP)
 
 
 def _slope(values: Tensor, time: Tensor) -> Tensor:

@@ -143,6 +143,9 @@ def _judged(search: Search, axis: int, above: float) -> AxisVerdict:
     share = share_of_exact(above, above, 1 + search.form[axis] / noise, problem.values, beaten)
     explanations = posterior([(share, exact), *(((1 - share) / len(LEVELS), named(level)) for level in LEVELS)])
 
+    # Of the squares that are noise.
+    scatter = noise * _CLEARLY**2 * math.sqrt(2 * problem.values)
+
     def left_by(grams: Grams, groups: list[Tensor]) -> float:
         """Squares that a set leaves, nominal values and time stamps being off as is likely."""
         return noise * float(weighed(grams, beside, [groups], noise).rss)
@@ -150,7 +153,7 @@ def _judged(search: Search, axis: int, above: float) -> AxisVerdict:
     def rest_of(one: Explanation[Candidate]) -> tuple[str, ...] | None:
         """What the remainder of an explanation follows, where that is more than the noise and form errors."""
         more = left_by(one.best.grams, one.best.groups) - noise * problem.values
-        if more <= max(noise * _CLEARLY**2 * math.sqrt(2 * problem.values), DIRECTIONS * search.form[axis]):
+        if more <= max(scatter, DIRECTIONS * search.form[axis]):
             return None
         return next((e.drivers for e in explanations if e.drivers and e.names == one.names), ())
 
@@ -165,7 +168,7 @@ def _judged(search: Search, axis: int, above: float) -> AxisVerdict:
         # Not what a value that is known no better explains as well.
         alone = (f for f in fits if len(f.members) == 1)
         hidden = min(alone, key=lambda f: left_by(f.grams, f.spec.groups)).members[0]
-        doubted = left_by(best.grams, []) > most
+        doubted = left_by(best.grams, []) > noise * problem.values + scatter
     marginals = {e: marginal(explanations, e) for e in {*(e for f in fits for e in f.members), *twins}}
     driver = next(iter(verdict.drivers), None) if verdict.outside else None
     return AxisVerdict(best, probability, marginals, classes, driver, hidden, doubted)

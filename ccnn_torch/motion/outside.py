@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.marginal_likelihood import Grams
-from ccnn_torch.motion.descent import sensitivities
+from ccnn_torch.motion.descent import STEP
 from ccnn_torch.motion.drivers import done, drivers_of
 from ccnn_torch.motion.fit import products, side_by_side, squares_unseen, weighed
 from ccnn_torch.motion.problem import Problem
@@ -24,6 +24,8 @@ NEARLY = 1.02
 """Ratio of RMS, of what is left of runs that were not fitted, up to which a set without a member is as good."""
 # Names that are looked for beside a torque, and fits of both together; and what such a torque follows.
 _BESIDE, _FITS = 2, 6
+# Share of a torque that changes from fit to fit where it has come to rest.
+_SETTLED = 0.02
 _FOLLOWED = ("speed", "position")
 
 Members = tuple[int, ...]
@@ -120,15 +122,19 @@ def _beside_torque(
     # Beside names, which act on the simulated motion, one that follows the measured motion would draw it there.
     push = _beside(found, axis, spec, tried[-1:], None, problem.data.position[axis])[0][1].does
     for _ in range(_BESIDE + 1):
+        last = None
         for _ in range(_FITS):
             _, _, spec, does = _beside(found, axis, spec, tried[-1:], push)[0][1]
+            if last is not None and float((does - last).square().sum()) <= _SETTLED**2 * float(does.square().sum()):
+                push = does
+                break
             # Half of the way: a torque that brakes is smaller on the motion that it makes.
-            push = (push + does) / 2
+            last, push = does, (push + does) / 2
         several = _beside(found, axis, spec, tried, push)
         yield several
-        last, _, spec, push = several[-1][1]
-        assert last.rows is not None
-        wide = torch.cat([found.nuisance, last.rows[1].expand(len(found.nuisance), -1, -1)], 1)
+        best, _, spec, push = several[-1][1]
+        assert best.rows is not None
+        wide = torch.cat([found.nuisance, best.rows[1].expand(len(found.nuisance), -1, -1)], 1)
         promised = promises(problem.under(axis, push), found.whitening, [(axis, spec)], wide, [variance])[0]
         more = (started(spec, variant, axis) for _, variant in sorted(promised, key=lambda one: -one[0]))
         # Numbers of names are told as they are without the torque.
@@ -154,39 +160,56 @@ def _beside(
         moved: motion that drivers follow, `b x s`; None = the simulated one.
     """
     problem = found.problem if push is None else found.problem.under(axis, push)
-    mine, theta, flat = torch.tensor([axis]), spec.theta, list(spec.flat)
+    theta, flat = spec.theta, list(spec.flat)
     low, high = (ends[axis, flat] for ends in problem.library.bounds)
     # A number at an end of what it may be stays there.
     free = (theta[flat] > low) & (theta[flat] < high)
-    every = enumerate(drivers_of(problem, axis, problem.positions(theta[None], mine)[0] if moved is None else moved))
-    drivers = {k: d for k, d in every if tried is None or k in tried}
-    torques = [d.columns for d in drivers.values() if d.is_torque] + ([] if push is None else [push[None]])
-    does = [*(d.columns for d in drivers.values() if not d.is_torque), done(problem, theta, axis, torch.cat(torques))]
-    columns, widths = torch.cat(does), [len(d.columns) for d in drivers.values()]
-    views = []
+    drivers, changes = _changes(problem, axis, spec, tried, push, moved)
+    parts, views = [1, len(flat), *(len(columns) for _, columns in drivers.values())], []
+    parts.append(len(changes) - sum(parts))
     # Whitened, and the position itself.
     for whitening in (found.whitening, white_noise(len(problem.axes))):
-        (residual,), (own,) = sensitivities(problem, whitening, theta[None], mine, [flat])
-        own, white = own * free[:, None], problem.whitened(columns, mine.expand(len(columns)), whitening)
-        y = residual + theta[flat] @ own + white[sum(widths) :].sum(0)
-        views.append((y, own, torch.split(white[: sum(widths)], widths)))
+        white = problem.whitened(changes, torch.tensor([axis]).expand(len(changes)), whitening)
+        residual, own, *each, in_place = torch.split(white, parts)
+        own = own * free[:, None]
+        views.append((residual[0] + theta[flat] @ own + in_place.sum(0), own, each))
     (y, own, each), (plain, own_plain, each_plain) = views
     sets = []
-    for driver, beside in zip(drivers.values(), each, strict=True):
+    for (name, _), beside in zip(drivers.values(), each, strict=True):
         x = torch.cat([own, beside])
         grams, groups = products(found.nuisance[axis], x, y, problem.values), torch.arange(len(own), len(x))
         rows, prior = (own, beside, y), prior_of(spec, drivers=1)
-        sets.append(Candidate(spec.members, (driver.name,), grams, [*spec.groups, groups], prior, rows))
+        sets.append(Candidate(spec.members, (name,), grams, [*spec.groups, groups], prior, rows))
     grams = side_by_side([one.grams for one in sets])
     means = weighed(grams, found.nuisance.shape[1], [one.groups for one in sets], None).mean
     result = []
-    for (k, driver), one, mean, beside in zip(drivers.items(), sets, means, each_plain, strict=True):
+    for (k, (_, columns)), one, mean, beside in zip(drivers.items(), sets, means, each_plain, strict=True):
         now, amount = theta.clone(), mean[len(flat) : len(flat) + len(beside)]
         now[flat] = torch.where(free, torch.maximum(torch.minimum(mean[: len(flat)], high), low), theta[flat])
         rest = plain - now[flat] @ own_plain - amount @ beside
-        does_now = torch.tensordot(amount, driver.columns, 1)
+        does_now = torch.tensordot(amount, columns, 1)
         result.append((k, _Beside(one, float(rest.square().sum()), spec._replace(theta=now), does_now)))
     return result
+
+
+def _changes(
+    problem: Problem, axis: int, spec: Spec, tried: Sequence[int] | None, push: Tensor | None, moved: Tensor | None
+) -> tuple[dict[int, tuple[str, Tensor]], Tensor]:
+    """As of `_beside`: names and columns of drivers, and rows `… x b x s`: the residual, and what numbers of the set,
+    drivers, and the torque that is in place change in the positions."""
+    flat = list(spec.flat)
+    theta = spec.theta.repeat(len(flat) + 1, 1)
+    theta[torch.arange(1, len(theta)), flat] += STEP
+    mine = torch.tensor([axis]).expand(len(theta))
+    places = problem.positions(theta, mine)
+    left = problem.left_by(places, mine)
+    every = drivers_of(problem, axis, places[0] if moved is None else moved)
+    drivers = {k: (d.name, d.columns()) for k, d in enumerate(every) if tried is None or k in tried}
+    torques = [columns for k, (_, columns) in drivers.items() if every[k].is_torque]
+    torques += [] if push is None else [push[None]]
+    does = done(problem, spec.theta, axis, places[0], torch.cat(torques))
+    direct = [columns for k, (_, columns) in drivers.items() if not every[k].is_torque]
+    return drivers, torch.cat([left[:1], (left[:1] - left[1:]) / STEP, *direct, does])
 
 
 def holds(problem: Problem, candidate: Candidate, nuisance: int) -> bool:

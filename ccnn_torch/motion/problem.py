@@ -185,7 +185,11 @@ class Problem:
 
     def residual(self, theta: Tensor, axis: Tensor) -> Tensor:
         """Measured less simulated, as `positions`; finite."""
-        far, left = _FARTHEST * self.unit[axis, None, None], self.data.position[axis].sub_(self.positions(theta, axis))
+        return self.left_by(self.positions(theta, axis), axis)
+
+    def left_by(self, moved: Tensor, axis: Tensor) -> Tensor:
+        """Measured less simulated, `p x b x s`, of positions that were simulated; finite."""
+        far, left = _FARTHEST * self.unit[axis, None, None], self.data.position[axis].sub_(moved)
         # What is no number is far away.
         return left.nan_to_num_(nan=math.inf).clamp_(-far, far)
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ccnn_torch.motion.compilable import compilable, pick
+from ccnn_torch.motion.compilable import compilable, pick, some
 
 Array = NDArray[np.float64]
 GAMMA = 1 - 1 / math.sqrt(2)
@@ -28,6 +28,8 @@ _STEEPEST = math.sqrt(2 / math.e)
 _FASTEST = 1e4
 # Seconds for which an axis stood before a log.
 _STOOD = 10.0
+# Times the parts of a step in which dry friction stops an axis or lets it go.
+_FINER = 4
 # From the middle stage to where the last one begins.
 _AHEAD = (1 - GAMMA) / GAMMA
 
@@ -228,6 +230,26 @@ def begun(axis: Axis, start: Array, push: Array) -> State:
 
 @compilable
 def advanced(axis: Axis, has: Given, state: State, given: Sample, parts: int) -> State:
+    """The state at the next sample, in so many parts; in more where dry friction stops the axis or lets it go."""
+    # Of an axis without friction the last digit says which way it creeps.
+    rubs = (axis.own.coulomb > 0) | (axis.own.load_friction > 0) | (axis.own.stribeck > 0)
+    found, turned = state, rubs | True
+    for many in (parts, _FINER * parts):
+        if some(turned):
+            now = _divided(axis, has, state, given, many)
+            found = State(
+                pick(turned, now.q, found.q),
+                pick(turned, now.v, found.v),
+                pick(turned, now.x, found.x),
+                pick(turned, now.w, found.w),
+                pick(turned, now.held, found.held),
+            )
+            turned = rubs & (np.sign(state.v) != np.sign(now.v))
+    return found
+
+
+@compilable
+def _divided(axis: Axis, has: Given, state: State, given: Sample, parts: int) -> State:
     """The state at the next sample, in so many parts."""
     fixed = _fixed(axis, has, given, parts)
     share, risen = 1.0 / parts, given.pushed - given.push

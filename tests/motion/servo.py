@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,6 +28,19 @@ def command(kind: int, time: Array) -> Array:
     return soft * 0.4 * np.sin(2 * np.pi * (0.2 * time + 0.2 * time**2))
 
 
+def between(time: Array, values: Array) -> Callable[[float], float]:
+    """Values on straight lines between samples: of one number numpy.interp takes many times as long."""
+    times: list[float] = time.tolist()
+    known: list[float] = values.tolist()
+
+    def value(t: float) -> float:
+        k = min(max(bisect(times, t), 1), len(times) - 1)
+        share = min(max((t - times[k - 1]) / (times[k] - times[k - 1]), 0.0), 1.0)
+        return known[k - 1] + share * (known[k] - known[k - 1])
+
+    return value
+
+
 def moved(
     time: Array,
     asked: Array,
@@ -46,12 +60,12 @@ def moved(
     tanh(q' / 0.002)`, where the motor makes
     `GAIN (u - q + integral * integral of u - q + derivative * (u' - q')) - drive q'`
     within its limit, and within the band takes u - q for 0."""
-    fast = np.gradient(asked, time)
+    wanted, fast = between(time, asked), between(time, np.gradient(asked, time))
 
     def rate(t: float, state: Array) -> list[float]:
         q, v, held = state.tolist()
-        u = float(np.interp(t - delay, time, asked))
-        lead = derivative and derivative * (float(np.interp(t - delay, time, fast)) - v)
+        u = wanted(t - delay)
+        lead = derivative and derivative * (fast(t - delay) - v)
         error = u - q - min(max(u - q, -band), band)
         motor = min(max(GAIN * (error + integral * held + lead) - drive * v, -limit), limit)
         torque = motor - (viscous - drive) * v - weight * math.sin(q) - cube * q**3 - dry * math.tanh(v / 0.002)
@@ -64,11 +78,12 @@ def moved(
 
 def moved_on_a_spring(time: Array, asked: Array, spring: float, damping: float, at_motor: bool) -> Array:
     """Position of the motor, or of the load behind the spring, `LOAD x'' = spring (q - x) + damping (q' - x')`."""
+    wanted = between(time, asked)
 
     def rate(t: float, state: Array) -> list[float]:
         q, v, x, w = state.tolist()
         pull = spring * (q - x) + damping * (v - w)
-        torque = GAIN * (float(np.interp(t, time, asked)) - q) - VISCOUS * v - pull
+        torque = GAIN * (wanted(t) - q) - VISCOUS * v - pull
         return [v, torque / (INERTIA - LOAD), w, (pull - MASS * 9.80665 * LENGTH * math.sin(x)) / LOAD]
 
     begin = [asked[0], 0.0, asked[0], 0.0]

@@ -51,6 +51,13 @@ def test_it_moves_as_its_equation_says(real: dict[str, float]) -> None:
     assert np.abs(error).max() < 2e-3 * np.ptp(asked)
 
 
+def test_an_axis_sticks_and_goes_on_in_time_between_samples() -> None:
+    asked = command(1, TIME)
+    times = np.unique(np.concatenate([TIME[:-1] + k / 16 * np.diff(TIME) for k in range(16)] + [TIME[-1:]]))
+    short = axis(times, np.interp(times, TIME, asked), **OWN, coulomb=0.01)
+    assert np.abs(axis(TIME, asked, **OWN, coulomb=0.01) - np.interp(TIME, times, short)).max() < 1e-4
+
+
 @pytest.mark.parametrize("at_motor", [False, True])
 def test_a_load_on_a_spring_pulls_at_the_motor(at_motor: bool) -> None:
     spring, damping, asked = 1.5, 0.01, command(0, TIME)
