@@ -210,7 +210,9 @@ MACHINES: dict[str, Callable[[], Known]] = {
     "arm by positions": lambda: arm("none"),
     "sliding arm": sliding_arm,
     "sliding arm with effects": lambda: with_effects(
-        sliding_arm(), ("joint_gain", "thermal", "compliance", "frame"), ("temperature", "load_x", "load_z")
+        sliding_arm(),
+        ("joint_gain", "thermal", "bending", "error_motion", "frame"),
+        ("temperature", "load_x", "load_z"),
     ),
     "scara": scara,
     "five axes": five_axis,

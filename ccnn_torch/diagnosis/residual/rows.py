@@ -18,6 +18,8 @@ _TIMES_USUAL = 10.0
 _LEVER = 0.3
 # Or where the joints move the platform so many times as far as usual.
 _GAIN = 3.0
+# Directions of fitted frames that move the rows less than this share of what the largest does are not known from them.
+_HARDLY = 1e-3
 
 
 def picked(situation: Situation, rows: Tensor) -> Situation:
@@ -70,12 +72,16 @@ def only_usable(values: Tensor, usable: Tensor) -> Tensor:
 def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
     """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back.
 
-    A frame that a group of rows has for itself acts in these alone.
+    A frame that a group of rows has for itself acts in these alone. What rows hardly show of frames stays as it is: a
+    tool that were metres longer would be a forearm that is a millimetre longer, where two axes are all but parallel.
     """
     index = [k for frame in fitted_frames(situation) for k in frame]
     if not index:
         return situation.jacobian[..., :0]
-    return only_usable(situation.parameter_jacobian[..., index] @ in_groups(situation), usable)
+    columns = only_usable(situation.parameter_jacobian[..., index] @ in_groups(situation), usable)
+    _, sizes, directions = torch.linalg.svd(torch.nan_to_num(columns).flatten(0, 1), full_matrices=False)
+    shown = directions[sizes > _HARDLY * sizes[0]]
+    return columns @ shown.mT @ shown
 
 
 def in_groups(situation: Situation) -> Tensor:
