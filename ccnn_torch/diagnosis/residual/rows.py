@@ -80,8 +80,8 @@ def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
         return situation.jacobian[..., :0]
     columns = only_usable(situation.parameter_jacobian[..., index] @ in_groups(situation), usable)
     _, sizes, directions = torch.linalg.svd(torch.nan_to_num(columns).flatten(0, 1), full_matrices=False)
-    shown = directions[sizes > _HARDLY * sizes[0]]
-    return columns @ shown.mT @ shown
+    shown: Tensor = directions[sizes > _HARDLY * sizes[0]]
+    return columns @ (shown.mT @ shown)
 
 
 def in_groups(situation: Situation) -> Tensor:
