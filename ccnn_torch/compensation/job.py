@@ -230,7 +230,7 @@ def sentences(output: Path, found: Compensated, model: LoadedModel) -> list[str]
     if found.outside:
         what, then = "what was measured", "what was learned fades there, geometry and effects hold"
         if model.machine is not None:
-            # The file of geometry alone does not say where it was measured.
+            # Geometry alone holds all over the workspace, measured or not.
             measured = len(model.machine.joints) > 0
             what = what if measured else "the joints of the identified machine"
             then = "geometry and effects hold there too" if measured else "its geometry holds there too"

@@ -308,8 +308,11 @@ class Gravity(Effect):
 _OF_BEAM = ("", " twist")
 # How a base tilts under a moment, in its own axes: symmetric in x and y, since its stiffest and its softest axis are
 # square to each other. A turn about z is one of the first joint.
-_OF_BASE = {"x": ((1, 0, 0), (0, 0, 0), (0, 0, 0)), "y": ((0, 0, 0), (0, 1, 0), (0, 0, 0))}
-_OF_BASE["xy"] = ((0, 1, 0), (1, 0, 0), (0, 0, 0))
+_OF_BASE = {
+    "x": ((1, 0, 0), (0, 0, 0), (0, 0, 0)),
+    "y": ((0, 0, 0), (0, 1, 0), (0, 0, 0)),
+    "xy": ((0, 1, 0), (1, 0, 0), (0, 0, 0)),
+}
 
 
 class Bending(Effect):

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ccnn_torch.effects.backlash import Backlash, Friction
 from ccnn_torch.effects.constant import Flexure, Frame, Geometry, Instrument, Tool, parameter_causes
-from ccnn_torch.effects.guides import ErrorMotion
+from ccnn_torch.effects.error_motion import ErrorMotion
 from ccnn_torch.effects.joints import Coupling, JointGain, JointOffset, Transmission
 from ccnn_torch.effects.loads import Bending, Compliance, Gravity, Sag, ThermalCompliance
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs

@@ -101,7 +101,7 @@ _WORDS = {
         "Counterbalance, brake and bearings of {where}, and the payload that the controller knows.",
     ),
     "bending": Words(
-        "links that bend between their joints, or a base that tilts",
+        "links that bend or a base that tilts",
         "bending",
         "1 / (E I) of a link as a beam, or the tilt of the base a N·m about its axes, for each unit of load; of weight "
         "and tool that times the weight.",

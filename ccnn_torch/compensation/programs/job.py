@@ -75,7 +75,7 @@ class Corrections:
         self._loaded, self._machine = loaded, machine
         self._base = np.eye(4) if base is None else frames_of(torch.tensor([*base], dtype=torch.float64)).numpy()
         self._counted = read_joint_map(loaded.joint_map, loaded.joints, loaded.columns)
-        # The file of geometry alone does not say where it was measured: its geometry holds as far as the joints go.
+        # Geometry alone holds as far as the joints go, measured or not.
         self._region = None
         if loaded.machine is not None and not len(loaded.machine.joints):
             low, high = loaded.region.T
