@@ -67,7 +67,8 @@ def compensate(
     status[1]: 0 exact, 1 outside what was measured or fallen back, 2 input not finite, 3 damped near a singular pose,
     at a limit or not settled (the nearest safe command). With --back it adds ideal_q1[unit]… and inside_domain[1];
     the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
-    serial arm takes the branch of guess_q1[unit]… where given, else that of the previous row, and OUT.csv also gets
+    serial arm takes the branch of guess_q1[unit]… where given, else that of the previous row; poses that the
+    machine does not reach are left out and named (exit code 2), and OUT.csv also gets
     command_x[unit]…, the poses to command where a controller takes no joints; so it does where IN.csv has goal_x[unit]…
     (poses as they are commanded) in the place of joints. With --sd it also adds
     deviation_sd_q1[unit]…: inside the domain, about 95 % of new measurements are within 1.96 times it of the predicted
