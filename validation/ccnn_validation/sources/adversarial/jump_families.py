@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ccnn_validation.sources.adversarial.effect import Effect
+from ccnn_validation.sources.adversarial.effect import Effect, absorbed
 from ccnn_validation.sources.adversarial.finish import NAMES_NOTHING, Builder, plain_case
 from ccnn_validation.sources.adversarial.machine import ARM, Array
 from ccnn_validation.sources.adversarial.ordinary import geometry, pick
@@ -18,6 +18,8 @@ __all__ = ["JUMP_FAMILIES"]
 
 _STRENGTHS = (5.0, 10.0, 30.0)
 _ORIENTED = ("stewart", ARM)
+# RMS share of an error that the parameters of a machine leave where they do the same to first order.
+_THE_SAME = 0.01
 
 
 def _frame(rig: Rig) -> Effect:
@@ -67,16 +69,28 @@ def _gated(rig: Rig, effect: Effect, state: Array) -> Effect:
 
 
 def _jump_truth(rig: Rig, cause: str, effect: Effect) -> Truth:
-    """Outside by the time; what jumps may be named beside it (it is there in half of the rows), and so may `jump`.
+    """Outside by the time; what jumps may be named beside it (it is there in half of the rows).
 
-    A constant error of frame, tool or one joint of a parallel machine is also one of its geometry. What the frame does
-    in time may have its own name.
+    A constant error of frame or tool is also one of the geometry of some parallel machines. One of several jumps of the
+    frame has its own name.
     """
-    names = [effect.name] if rig.machine.name == ARM else [effect.name, "geometry"]
+    names = [effect.name, *(["geometry"] if absorbed(rig, effect, ("geometry",)) < _THE_SAME else [])]
     names += ["frame_drift"] if effect.name == "frame" else []
-    sets = [NAMES_NOTHING, *(frozenset({n}) for n in dict.fromkeys(names))]
-    accepted = (*sets, *(s | {"jump"} for s in sets))
+    accepted = (NAMES_NOTHING, *(frozenset({n}) for n in dict.fromkeys(names)))
     return Truth("outside", (cause,), accepted, True, ("time",))
+
+
+def _named_jump(rig: Rig, effect: Effect) -> Truth | None:
+    """A jump that the library has a name for; None where it has none."""
+    if effect.name == "frame":
+        return Truth("single", ("frame_drift",), (frozenset({"frame_drift"}),))
+    if effect.name != "joint_offset" or effect.joints is None:
+        return None
+    accepted = [frozenset({"homing"})]
+    if rig.machine.name == ARM and effect.joints[:, 0].any():
+        # A turn of the whole arm about a fixed axis: the very same.
+        accepted.append(frozenset({"frame_drift"}))
+    return Truth("single", ("homing",), tuple(accepted))
 
 
 def _jump(make: Callable[[Rig], Effect], machines: Sequence[str] = ALL) -> Builder:
@@ -88,9 +102,7 @@ def _jump(make: Callable[[Rig], Effect], machines: Sequence[str] = ALL) -> Build
         start = int(rng.integers(rig.rows // 3, 2 * rig.rows // 3))
         effect = make(rig)
         after = _gated(rig, effect, (np.arange(rig.rows) >= start).astype(np.float64))
-        truth = _jump_truth(rig, family, effect)
-        if effect.name == "frame":
-            truth = Truth("single", ("frame_drift",), (frozenset({"frame_drift"}),))
+        truth = _named_jump(rig, effect) or _jump_truth(rig, family, effect)
         return plain_case(family, rig, after, float(rng.choice(_STRENGTHS)), truth)
 
     return build
