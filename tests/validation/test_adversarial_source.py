@@ -36,6 +36,9 @@ def test_case(family):
     if case.noise is not None:
         assert set(case.noise) == set(machine.pose_units) and min(case.noise.values()) > 0
     _check_truth(case.truth, case.columns, machine)
+    if case.truth.kind == "outside" and case.truth.outside is None:
+        # Only what looks like more noise, and only where nobody has said how much there is, may go without a word.
+        assert case.noise is None
     if case.truth.kind == "data":
         return
     nominal = machine.forward(np.stack([case.columns[h] for h in joints], -1))

@@ -131,15 +131,19 @@ def _unrecorded_load(family: str, rng: np.random.Generator) -> SourceCase:
 
 
 def _unrecorded_direction(family: str, rng: np.random.Generator) -> SourceCase:
-    """Backlash without the direction columns: outside, or nothing; who infers them from the rows' order is right."""
+    """Backlash without the direction columns: outside; who infers them from the rows' order is right.
+
+    It looks like more noise: with a given noise an answer must say one of the two.
+    """
     rig = draw_rig(rng)
     effect = ordinary(rig, "backlash")
     rig.shown.discard("direction")
     strength = float(rng.choice(_STRONG))
     found = single(effect, strength).accepted
     drivers = ("direction", *rig.machine.joint_names)
-    truth = Truth("outside", ("backlash",), (NAMES_NOTHING, *found), None, drivers)
-    return plain_case(family, rig, effect, strength, truth)
+    truth = Truth("outside", ("backlash",), (NAMES_NOTHING, *found), True, drivers, enough=found)
+    case = plain_case(family, rig, effect, strength, truth)
+    return case if case.noise is not None else replace(case, truth=replace(truth, outside=None))
 
 
 DATA_FAMILIES: dict[str, Builder] = {

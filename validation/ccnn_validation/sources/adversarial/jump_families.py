@@ -11,6 +11,7 @@ from ccnn_validation.sources.adversarial.effect import Effect, absorbed
 from ccnn_validation.sources.adversarial.finish import NAMES_NOTHING, Builder, plain_case
 from ccnn_validation.sources.adversarial.machine import ARM, Array
 from ccnn_validation.sources.adversarial.ordinary import geometry, pick
+from ccnn_validation.sources.adversarial.outside import SEEN
 from ccnn_validation.sources.adversarial.rig import ALL, Rig, draw_rig
 from ccnn_validation.sources.case import SourceCase, Truth
 
@@ -20,6 +21,8 @@ _STRENGTHS = (5.0, 10.0, 30.0)
 _ORIENTED = ("stewart", ARM)
 # RMS share of an error that the parameters of a machine leave where they do the same to first order.
 _THE_SAME = 0.01
+# Terms of the library's random walk.
+_WALK = 4
 
 
 def _frame(rig: Rig) -> Effect:
@@ -122,21 +125,24 @@ def _loose_bolt(family: str, rng: np.random.Generator) -> SourceCase:
 def _walking_zero(family: str, rng: np.random.Generator) -> SourceCase:
     """The zero of a joint walks at random: outside by the time.
 
-    `drift` beside that is no error, since a walk is one. It is enough alone where a straight and a logarithmic trend
-    from the first row explain half of the walk (RMS), as the library calls its random walk no evidence alone.
+    `drift` beside that is no error, since a walk is one. It is enough alone where its form (a straight and a
+    logarithmic trend, and the first terms of a random walk) leaves less than twice the noise.
     """
     rig = draw_rig(rng, rows=(100, 400))
     rig.show("time")
     steps = rng.normal(size=rig.rows) * np.sqrt(np.diff(rig.time, prepend=rig.time[0]))
     walk = np.cumsum(steps)
-    trend = np.stack([rig.time, np.log1p(rig.time / 1800.0)], -1)
+    share = (rig.time - rig.time[0]) / np.ptp(rig.time)
+    waves = [np.sin((k + 0.5) * np.pi * share) for k in range(_WALK)]
+    trend = np.stack([share, np.log1p((rig.time - rig.time[0]) / 1800.0), *waves], -1)
     rest = walk - trend @ np.linalg.lstsq(trend, walk, rcond=None)[0]
-    straight = bool(np.sum(rest**2) < 0.5 * np.sum(walk**2))
+    left = float(np.linalg.norm(rest) / np.linalg.norm(walk))
     change = np.zeros_like(rig.joints)
     change[:, pick(rig, 1)[0]] = walk
-    accepted = (NAMES_NOTHING, frozenset({"drift"}))
-    truth = Truth("outside", (family,), accepted, None if straight else True, ("time",))
-    return plain_case(family, rig, Effect(family, change), float(rng.choice(_STRENGTHS)), truth)
+    named, strength = frozenset({"drift"}), float(rng.choice(_STRENGTHS))
+    enough = (named,) if left * strength < SEEN else ()
+    truth = Truth("outside", (family,), (NAMES_NOTHING, named), True, ("time",), enough=enough)
+    return plain_case(family, rig, Effect(family, change), strength, truth)
 
 
 JUMP_FAMILIES: dict[str, Builder] = {

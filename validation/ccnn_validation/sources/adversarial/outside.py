@@ -36,8 +36,8 @@ def outside_smooth(rig: Rig, effect: Effect, strength: float, drivers: Sequence[
     """
     left = {names: absorbed(rig, effect, names) for names in _SMOOTH}
     large = tuple(names for names in _SMOOTH if left[names] <= _HARDLY_SMOOTH)
-    must = True if min(left.values()) * strength >= SEEN else None
-    return Truth("outside", (effect.name,), (NAMES_NOTHING, *large), must, tuple(drivers))
+    enough = tuple(names for names in large if left[names] * strength < SEEN)
+    return Truth("outside", (effect.name,), (NAMES_NOTHING, *large), True, tuple(drivers), enough=enough)
 
 
 def load_names(rig: Rig) -> tuple[str, ...]:
