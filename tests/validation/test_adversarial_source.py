@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from ccnn_validation.sources.adversarial import FAMILIES, make
+from ccnn_validation.sources.adversarial.data_families import DATA_FAMILIES
 from ccnn_validation.sources.adversarial.effect import absorbed, measured, scaled, strength_of
 from ccnn_validation.sources.adversarial.machine import ARM, machine_of
 from ccnn_validation.sources.adversarial.ordinary import ORDINARY, ordinary
@@ -60,6 +61,16 @@ def _check_truth(truth, columns, machine):
     if truth.kind in ("single", "pair", "several"):
         assert frozenset(truth.causes) in truth.accepted and truth.outside is not True
     assert (truth.kind == "data") == bool(truth.mention)
+
+
+def test_a_mistake_is_not_told_by_words_of_any_verdict():
+    said = (
+        "compliance of joints 1 and 2, calculated over all rows in the order measured; the noise of a row has a "
+        "correlation of 0.3 with that of the row before; what is left follows direction 1, shifted along the axis, in "
+        "units of the noise; record direction2[1] (the sign of each joint's last motion), in this design of zero load"
+    )
+    for family in DATA_FAMILIES:
+        assert not any(word in said for word in make(family, 3).truth.mention), family
 
 
 @pytest.mark.parametrize("name", [*ORDINARY, "geometry"])
