@@ -8,6 +8,7 @@ import numpy as np
 
 from ccnn_validation.sources.adversarial.effect import Effect, measured, scaled
 from ccnn_validation.sources.adversarial.finish import Builder, finish, plain_case, single
+from ccnn_validation.sources.adversarial.machine import ARM
 from ccnn_validation.sources.adversarial.ordinary import ORDINARY, ordinary, pick
 from ccnn_validation.sources.adversarial.rig import ALL, draw_rig
 from ccnn_validation.sources.case import SourceCase, Truth
@@ -45,7 +46,8 @@ def _collinear(family: str, rng: np.random.Generator) -> SourceCase:
     """The temperature rises in proportion to the time: growth of all lengths without a lag, or joints that drift.
 
     Growth changes with the place, a drift of some joints does not: on rows all over the workspace, at ten times the
-    noise, they can be told apart. A drift may be called thermal all the same (drives that warm up).
+    noise, they can be told apart. A drift may be called thermal all the same: mounts that move joints with the
+    temperature.
     """
     rig = draw_rig(rng)
     rig.temperature = 20.0 + rng.uniform(4.0, 9.0) * rig.time / rig.time[-1]
@@ -61,8 +63,10 @@ def _collinear(family: str, rng: np.random.Generator) -> SourceCase:
     which = pick(rig, int(rng.integers(1, 3)))
     rate[which] = rng.choice([-1.0, 1.0], len(which)) * rng.uniform(0.5, 1.5, len(which))
     effect = Effect("drift", joints=(rig.time / rig.time[-1])[:, None] * rate)
-    accepted = (frozenset({"drift"}), frozenset({"thermal"}))
-    return plain_case(family, rig, effect, strength, Truth("single", ("drift",), accepted))
+    # The first joint of an arm turns the whole of it about a fixed axis: a frame that creeps does the very same.
+    creeps = rig.machine.name == ARM and which == [0]
+    accepted = (frozenset({n}) for n in ("drift", "thermal", *(["frame_drift"] if creeps else [])))
+    return plain_case(family, rig, effect, strength, Truth("single", ("drift",), tuple(accepted)))
 
 
 def _decoys(cause: str) -> Builder:

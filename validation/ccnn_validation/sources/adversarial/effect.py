@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,9 @@ from ccnn_validation.sources.adversarial.machine import Array
 from ccnn_validation.sources.adversarial.rig import Rig
 
 __all__ = ["Effect", "absorbed", "combined", "measured", "scaled", "strength_of"]
+
+_FRAMES = ("base_", "tool_")
+"""What parameters of an arm's frames begin with: none of the cause `geometry`."""
 
 
 @dataclass(frozen=True)
@@ -86,20 +89,21 @@ def scaled(rig: Rig, effect: Effect, strength: float) -> Effect:
     return found
 
 
-def absorbed(rig: Rig, effect: Effect) -> float:
-    """RMS share of an error that smooth errors of the machine leave, 0 to 1.
+def absorbed(rig: Rig, effect: Effect, names: Collection[str]) -> float:
+    """RMS share of an error that smooth errors of the machine leave, fitted to the rows, 0 to 1.
 
-    Smooth errors are constants and gains of the joints and all parameters of the mechanism, fitted to the rows: an
-    answer that names them is right where they leave nothing.
+    names: some of `joint_offset`, `joint_gain` and `geometry`. An answer of these is right where they leave nothing.
     """
     machine = rig.machine
     small = scaled(rig, effect, 1.0)
     error = (machine.twist(measured(rig, small), rig.pose) / rig.sigma).reshape(-1)
     by_joint = rig.jacobian / rig.sigma[:, None]
     by_gain = by_joint * (rig.joints - machine.middle)[:, None, :]
-    which = np.arange(len(machine.nominal))
+    which = np.array([i for i, g in enumerate(machine.model.geometry) if not g.name.startswith(_FRAMES)])
     by_parameter = machine.parameter_jacobian(rig.joints, rig.pose, which) / rig.sigma[:, None]
-    basis = np.concatenate([by_joint, by_gain, by_parameter], -1).reshape(len(error), -1)
+    # A gain may be 0 elsewhere than in the middle.
+    parts = {"joint_offset": by_joint, "joint_gain": np.concatenate([by_joint, by_gain], -1), "geometry": by_parameter}
+    basis = np.concatenate([parts[n] for n in names], -1).reshape(len(error), -1)
     # Redundant parameters must not fit noise of rounding.
     norm = np.linalg.norm(basis, axis=0)
     kept = basis[:, norm > 0] / norm[norm > 0]

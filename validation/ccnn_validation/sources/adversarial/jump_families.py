@@ -7,10 +7,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ccnn_validation.sources.adversarial.effect import Effect
+from ccnn_validation.sources.adversarial.effect import Effect, absorbed
 from ccnn_validation.sources.adversarial.finish import NAMES_NOTHING, Builder, plain_case
 from ccnn_validation.sources.adversarial.machine import ARM, Array
 from ccnn_validation.sources.adversarial.ordinary import geometry, pick
+from ccnn_validation.sources.adversarial.outside import SEEN
 from ccnn_validation.sources.adversarial.rig import ALL, Rig, draw_rig
 from ccnn_validation.sources.case import SourceCase, Truth
 
@@ -18,6 +19,10 @@ __all__ = ["JUMP_FAMILIES"]
 
 _STRENGTHS = (5.0, 10.0, 30.0)
 _ORIENTED = ("stewart", ARM)
+# RMS share of an error that the parameters of a machine leave where they do the same to first order.
+_THE_SAME = 0.01
+# Terms of the library's random walk.
+_WALK = 4
 
 
 def _frame(rig: Rig) -> Effect:
@@ -67,16 +72,28 @@ def _gated(rig: Rig, effect: Effect, state: Array) -> Effect:
 
 
 def _jump_truth(rig: Rig, cause: str, effect: Effect) -> Truth:
-    """Outside by the time; what jumps may be named beside it (it is there in half of the rows), and so may `jump`.
+    """Outside by the time; what jumps may be named beside it (it is there in half of the rows).
 
-    A constant error of frame, tool or one joint of a parallel machine is also one of its geometry. What the frame does
-    in time may have its own name.
+    A constant error of frame or tool is also one of the geometry of some parallel machines. One of several jumps of the
+    frame has its own name.
     """
-    names = [effect.name] if rig.machine.name == ARM else [effect.name, "geometry"]
+    names = [effect.name, *(["geometry"] if absorbed(rig, effect, ("geometry",)) < _THE_SAME else [])]
     names += ["frame_drift"] if effect.name == "frame" else []
-    sets = [NAMES_NOTHING, *(frozenset({n}) for n in dict.fromkeys(names))]
-    accepted = (*sets, *(s | {"jump"} for s in sets))
+    accepted = (NAMES_NOTHING, *(frozenset({n}) for n in dict.fromkeys(names)))
     return Truth("outside", (cause,), accepted, True, ("time",))
+
+
+def _named_jump(rig: Rig, effect: Effect) -> Truth | None:
+    """A jump that the library has a name for; None where it has none."""
+    if effect.name == "frame":
+        return Truth("single", ("frame_drift",), (frozenset({"frame_drift"}),))
+    if effect.name != "joint_offset" or effect.joints is None:
+        return None
+    accepted = [frozenset({"homing"})]
+    if rig.machine.name == ARM and effect.joints[:, 0].any():
+        # A turn of the whole arm about a fixed axis: the very same.
+        accepted.append(frozenset({"frame_drift"}))
+    return Truth("single", ("homing",), tuple(accepted))
 
 
 def _jump(make: Callable[[Rig], Effect], machines: Sequence[str] = ALL) -> Builder:
@@ -88,9 +105,7 @@ def _jump(make: Callable[[Rig], Effect], machines: Sequence[str] = ALL) -> Build
         start = int(rng.integers(rig.rows // 3, 2 * rig.rows // 3))
         effect = make(rig)
         after = _gated(rig, effect, (np.arange(rig.rows) >= start).astype(np.float64))
-        truth = _jump_truth(rig, family, effect)
-        if effect.name == "frame":
-            truth = Truth("single", ("frame_drift",), (frozenset({"frame_drift"}),))
+        truth = _named_jump(rig, effect) or _jump_truth(rig, family, effect)
         return plain_case(family, rig, after, float(rng.choice(_STRENGTHS)), truth)
 
     return build
@@ -110,21 +125,24 @@ def _loose_bolt(family: str, rng: np.random.Generator) -> SourceCase:
 def _walking_zero(family: str, rng: np.random.Generator) -> SourceCase:
     """The zero of a joint walks at random: outside by the time.
 
-    `drift` beside that is no error, since a walk is one. It is enough alone where a straight and a logarithmic trend
-    from the first row explain half of the walk (RMS), as the library calls its random walk no evidence alone.
+    `drift` beside that is no error, since a walk is one. It is enough alone where its form (a straight and a
+    logarithmic trend, and the first terms of a random walk) leaves less than twice the noise.
     """
     rig = draw_rig(rng, rows=(100, 400))
     rig.show("time")
     steps = rng.normal(size=rig.rows) * np.sqrt(np.diff(rig.time, prepend=rig.time[0]))
     walk = np.cumsum(steps)
-    trend = np.stack([rig.time, np.log1p(rig.time / 1800.0)], -1)
+    share = (rig.time - rig.time[0]) / np.ptp(rig.time)
+    waves = [np.sin((k + 0.5) * np.pi * share) for k in range(_WALK)]
+    trend = np.stack([share, np.log1p((rig.time - rig.time[0]) / 1800.0), *waves], -1)
     rest = walk - trend @ np.linalg.lstsq(trend, walk, rcond=None)[0]
-    straight = bool(np.sum(rest**2) < 0.5 * np.sum(walk**2))
+    left = float(np.linalg.norm(rest) / np.linalg.norm(walk))
     change = np.zeros_like(rig.joints)
     change[:, pick(rig, 1)[0]] = walk
-    accepted = (NAMES_NOTHING, frozenset({"drift"}))
-    truth = Truth("outside", (family,), accepted, None if straight else True, ("time",))
-    return plain_case(family, rig, Effect(family, change), float(rng.choice(_STRENGTHS)), truth)
+    named, strength = frozenset({"drift"}), float(rng.choice(_STRENGTHS))
+    enough = (named,) if left * strength < SEEN else ()
+    truth = Truth("outside", (family,), (NAMES_NOTHING, named), True, ("time",), enough=enough)
+    return plain_case(family, rig, Effect(family, change), strength, truth)
 
 
 JUMP_FAMILIES: dict[str, Builder] = {

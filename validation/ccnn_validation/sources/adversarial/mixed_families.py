@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ccnn_validation.sources.adversarial.effect import Effect, absorbed, combined, measured, scaled
+from ccnn_validation.sources.adversarial.effect import Effect, combined, measured, scaled
 from ccnn_validation.sources.adversarial.finish import Builder, finish, plain_case
 from ccnn_validation.sources.adversarial.machine import ARM
 from ccnn_validation.sources.adversarial.ordinary import (
@@ -16,7 +16,6 @@ from ccnn_validation.sources.adversarial.ordinary import (
     torque,
     weight_torque,
 )
-from ccnn_validation.sources.adversarial.outside import SMOOTH
 from ccnn_validation.sources.adversarial.rig import ALL, Rig, draw_rig
 from ccnn_validation.sources.case import SourceCase, Truth
 
@@ -97,7 +96,10 @@ def _friction_with_constant(family: str, rng: np.random.Generator) -> SourceCase
 
 
 def _thermal_two_lags(family: str, rng: np.random.Generator) -> SourceCase:
-    """A thin part follows the hall in 10 minutes, a cast one in three hours; both let all lengths grow."""
+    """A thin part follows the hall in 10 minutes, a cast one in three hours; both let all lengths grow.
+
+    Thermal growth alone, whose form has a second lag.
+    """
     rig = draw_rig(rng)
     rig.show("time", "temperature")
     share = float(rng.uniform(0.3, 0.7))
@@ -105,7 +107,7 @@ def _thermal_two_lags(family: str, rng: np.random.Generator) -> SourceCase:
     lengths = np.zeros_like(rig.machine.nominal)
     sized = rig.machine.parameters_like()
     lengths[sized] = rig.machine.nominal[sized]
-    effect = Effect("thermal", parameters=warm[:, None] * lengths, textbook=False)
+    effect = Effect("thermal", parameters=warm[:, None] * lengths)
     return plain_case(family, rig, effect, float(rng.choice([5.0, 10.0, 30.0])))
 
 
@@ -124,20 +126,16 @@ def _curved_coupling(family: str, rng: np.random.Generator) -> SourceCase:
 def _wrong_payload(family: str, rng: np.random.Generator) -> SourceCase:
     """A payload that nobody wrote down, the same in all rows; or one that the load column has 20 % too small.
 
-    The first is weight, gravity; where constants, gains and geometry explain it, too, they are right as well. The
-    second is compliance of the drives, by another factor.
+    The first is weight, gravity; no compliance, which goes by the recorded load. The second is compliance of the
+    drives, by another factor.
     """
     rig = draw_rig(rng)
     strength = float(rng.choice([10.0, 30.0]))
     # All drives: a vertical axis alone would feel no weight.
     turn = weight_torque(rig) * rng.uniform(0.5, 1.5, rig.machine.count)
     if rng.random() < 0.5:
-        effect = Effect("gravity", turn)
-        enough = absorbed(rig, effect) * strength < 2.0
-        names = (frozenset({"gravity"}), frozenset({"compliance"}), *(SMOOTH if enough else ()))
-        # An arm's own weight is spread over its links; a payload pulls at the tool.
-        outside = None if rig.machine.name == ARM else False
-        return plain_case(family, rig, effect, strength, Truth("single", ("gravity",), names, outside))
+        # An arm's own weight is spread over its links; a payload pulls at the tool, for which gravity has coefficients.
+        return plain_case(family, rig, Effect("gravity", turn), strength)
     kilograms = rng.choice([0.0, 2.0, 5.0, 10.0], rig.rows)
     down = "z" if "z" in rig.machine.pose_names else "y"
     rig.load = np.zeros_like(rig.load)

@@ -9,9 +9,10 @@ from ccnn_validation.sources.adversarial.finish import NAMES_NOTHING
 from ccnn_validation.sources.adversarial.rig import Rig
 from ccnn_validation.sources.case import Truth
 
-__all__ = ["SMOOTH", "load_names", "outside_smooth"]
+__all__ = ["SEEN", "load_names", "outside_smooth"]
 
-SMOOTH = (
+# Names for the part of an error that is a smooth function of the place.
+_SMOOTH = (
     frozenset({"joint_offset"}),
     frozenset({"joint_gain"}),
     frozenset({"joint_offset", "joint_gain"}),
@@ -19,10 +20,10 @@ SMOOTH = (
     frozenset({"geometry", "joint_offset"}),
     frozenset({"geometry", "joint_gain"}),
 )
-"""Names for the part of an error that is a smooth function of the place."""
 
-# In units of the noise: what smooth errors must leave, so that an answer has to say outside.
-_SEEN = 2.0
+SEEN = 2.0
+"""In units of the noise: what the names of an answer must leave, so that it has to say outside."""
+
 # A share of the error left above this: the smooth part is no finding of its own.
 _HARDLY_SMOOTH = 0.9
 
@@ -30,13 +31,13 @@ _HARDLY_SMOOTH = 0.9
 def outside_smooth(rig: Rig, effect: Effect, strength: float, drivers: Sequence[str]) -> Truth:
     """An error that depends on the joints alone, without a name.
 
-    Constants and gains of the joints and the geometry take up a part of such an error. Naming them for it is right
-    where the part is large, and enough where they leave less than twice the noise.
+    Constants and gains of the joints and the geometry take up a part of such an error. Naming some of them for it is
+    right where their part is large, and enough where they leave less than twice the noise.
     """
-    share = absorbed(rig, effect)
-    names = () if share > _HARDLY_SMOOTH else SMOOTH
-    must = True if share * strength >= _SEEN else None
-    return Truth("outside", (effect.name,), (NAMES_NOTHING, *names), must, tuple(drivers))
+    left = {names: absorbed(rig, effect, names) for names in _SMOOTH}
+    large = tuple(names for names in _SMOOTH if left[names] <= _HARDLY_SMOOTH)
+    enough = tuple(names for names in large if left[names] * strength < SEEN)
+    return Truth("outside", (effect.name,), (NAMES_NOTHING, *large), True, tuple(drivers), enough=enough)
 
 
 def load_names(rig: Rig) -> tuple[str, ...]:
