@@ -80,14 +80,21 @@ class FoundMachine(NamedTuple):
         return self.nominal.with_nominal(self.values)
 
     def rows(self, count: int) -> Situation:
-        """Rows all over the region, the same for the same machine."""
+        """Rows all over the region, the same for the same machine.
+
+        Legs of a parallel machine move together: the joints are those of poses of its workspace, stretched to where it
+        was measured. Legs that are drawn one by one would turn its platform as no record does.
+        """
         generator = torch.Generator().manual_seed(0)
-        edges = torch.cat([self.joints, self.edges])
-        share = torch.rand(count, len(edges), generator=generator, dtype=torch.float64)
-        values = edges[:, 0] + (edges[:, 1] - edges[:, 0]) * share
-        n = len(self.joints)
-        given = {c.name: values[:, n + i] for i, c in enumerate(self.covariates)}
-        return Situation(self.nominal, values[:, :n], given, self.gravity)
+        drawn = self.nominal.sample_joints(count, generator)
+        drawn = drawn[torch.isfinite(drawn).all(-1)]
+        low, high = drawn.amin(0), drawn.amax(0)
+        share = (drawn - low) / (high - low).clamp_min(torch.finfo(drawn.dtype).tiny)
+        joints = self.joints[:, 0] + (self.joints[:, 1] - self.joints[:, 0]) * share
+        share = torch.rand(len(drawn), len(self.edges), generator=generator, dtype=torch.float64)
+        values = self.edges[:, 0] + (self.edges[:, 1] - self.edges[:, 0]) * share
+        given = {c.name: values[:, i] for i, c in enumerate(self.covariates)}
+        return Situation(self.nominal, joints, given, self.gravity)
 
 
 def found_block(

@@ -57,6 +57,17 @@ def arm_axes(arm: SerialArm, joints: Tensor, values: Tensor) -> tuple[Tensor, Te
     return points, axes
 
 
+def _weights(arm: SerialArm, joints: Tensor, values: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+    """Where an arm's links weigh in the base frame, `... x n x 3` [m], and their shares, `n` [1]; evenly at their ends
+    `... x n x 3` [m] where their masses are not known."""
+    if not len(arm.masses):
+        return ends, ends.new_full(ends.shape[-2:-1], 1 / ends.shape[-2])
+    base, origin = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3]
+    tool = ((ends[..., -1:, :] - origin[..., None, :]) @ base)[..., 0, :]
+    places, shares = arm.weighs(arm.link_frames(joints, values), tool)
+    return places @ base.mT + origin[..., None, :], shares
+
+
 _SECONDARY = 0.3
 # How far from the measured point a load may act [m].
 _AWAY = 0.1
@@ -241,12 +252,13 @@ _MOMENT = 5.0
 class Gravity(Effect):
     """Δq_i = c_i τ_i, τ = force or torque of the machine's own weight on the joint per newton, by virtual work.
 
-    For an arm the newton is spread evenly over the origins of its links and the tool; for other machines it hangs on
-    the measured point of the platform. c is compliance times weight: a sag for each metre of lever (turning joints), or
-    along a joint that carries all (sliding ones). Secondary: a joint that stiffens, d τ|τ| / 0.3 m (or / 1); what
-    another mass distribution does: for an arm a weight at the tool, and one that is larger towards the base; for a
-    revolute drive of another machine the weight of its crank, a torque in proportion to cos q and sin q, and for a
-    platform that turns the moment of its weight about the measured point, in its axes, on drives of plausible give.
+    For an arm the newton is where its masses are, or spread evenly over the origins of its links and the tool where
+    these are not known; for other machines it hangs on the measured point of the platform. c is compliance times
+    weight: a sag for each metre of lever (turning joints), or along a joint that carries all (sliding ones). Secondary:
+    a joint that stiffens, d τ|τ| / 0.3 m (or / 1); what another mass distribution does: for an arm a weight at the
+    tool, and one that is larger towards the base; for a revolute drive of another machine the weight of its crank, a
+    torque in proportion to cos q and sin q, and for a platform that turns the moment of its weight about the measured
+    point, in its axes, on drives of plausible give.
     """
 
     name = "gravity"
@@ -321,7 +333,8 @@ class Bending(Effect):
 
     Under a force F and a moment M at its end a beam of length L gives F L³ / 3EI + M L² / 2EI and turns by
     F L² / 2EI + M L / EI (Euler and Bernoulli), and by M L / GJ about itself. Coefficients of a link: 1/EI for the
-    recorded load; weight / EI for own weight, 1 N of which is spread evenly over the origins of the links and the tool.
+    recorded load; weight / EI for own weight, 1 N of which is where the masses are, or spread evenly over the ends of
+    the links where these are not known.
     Secondary: the same for a weight at the tool alone, and of each 1/GJ; and for the weight of the link itself along
     it, which gives F L³ / 8EI and turns by F L² / 6EI. The base tilts about its origin by C M, M the moment there and C
     a symmetric matrix in its axes x and y: a table is softer in one direction. To first order about the nominal pose.
@@ -369,8 +382,9 @@ class Bending(Effect):
         beam, beyond, n = ends - points, tool - ends, points.shape[-2]
         down = situation.down.unsqueeze(-2).expand_as(beam)
         # What hangs at the end of link j acts on link i ≤ j.
-        onward = torch.ones(n, n, dtype=points.dtype).triu() / n
-        lever = (onward[..., None] * (ends.unsqueeze(-3) - ends.unsqueeze(-2))).sum(-2)
+        places, shares = _weights(arm, situation.joints, values, ends)
+        onward = torch.ones(n, n, dtype=points.dtype).triu() * shares
+        lever = (onward[..., None] * (places.unsqueeze(-3) - ends.unsqueeze(-2))).sum(-2)
         pulls = [(onward.sum(-1, keepdim=True) * down, _cross(lever, down)), (down, _cross(beyond, down))]
         if situation.loaded:
             wrench = situation.whole.wrench.unsqueeze(-2)

@@ -269,7 +269,8 @@ class Situation:
     def own_weight_torque(self) -> Tensor:
         """Force or torque on each joint of 1 N of the machine's own weight, `... x s x n` [N or N·m per N].
 
-        Of an arm it is spread evenly over the origins of its links and the tool; of others it is the platform's.
+        Of an arm it is where its masses are, or, where these are not known, spread evenly over the origins of its links
+        and the tool; of others it is the platform's.
         """
         if isinstance(self.whole.mechanism, SerialArm):
             return self.whole._links_torque(torch.ones_like)
@@ -277,13 +278,13 @@ class Situation:
 
     @cached_property
     def inner_weight_torque(self) -> Tensor:
-        """As `own_weight_torque` of an arm whose links are the heavier the nearer they are to its base: the weight at
-        an origin falls linearly to 0 at the tool."""
+        """As `own_weight_torque` of an arm whose links are the heavier the nearer they are to its base: each is
+        multiplied by what falls linearly to 0 at the last."""
         return self.whole._links_torque(lambda far: 1 - far)
 
     def _links_torque(self, heavy: Callable[[Tensor], Tensor]) -> Tensor:
-        """Torques of 1 N over the origins of an arm's links and the tool, `... x s x n`; heavy: the share of each by
-        how far out it is, 0 to 1, `k`."""
+        """Torques of 1 N over the links of an arm, `... x s x n`; heavy: what each is multiplied by, by how far out it
+        is, 0 to 1, `k`."""
         arm = self.mechanism
         assert isinstance(arm, SerialArm)
         values = arm.resolve(self.parameters)
@@ -293,8 +294,12 @@ class Situation:
             frames = arm.link_frames(joints, values)
             rotation, flange = frames[-1]
             tool = flange + (rotation @ values[..., -6:-3, None]).squeeze(-1)
-            places = torch.stack([*(place for _, place in frames[1:]), tool], -2)
-            share = heavy(torch.linspace(0, 1, places.shape[-2], dtype=places.dtype))
+            if len(arm.masses):
+                places, share = arm.weighs(frames, tool)
+            else:
+                places = torch.stack([*(place for _, place in frames[1:]), tool], -2)
+                share = torch.ones(places.shape[-2], dtype=places.dtype)
+            share = share * heavy(torch.linspace(0, 1, len(share), dtype=places.dtype))
             down_there: Tensor = share @ (places @ down.unsqueeze(-1)) / share.sum()
             return down_there
 

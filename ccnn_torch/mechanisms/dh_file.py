@@ -37,7 +37,8 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     (+1), `parallel_axes`, `base_frame` and `tool_frame`
     (a text with "unknown", "identity", or [x, y, z, rx, ry, rz]; unknown when missing), `tool_offset` (likewise, but
     [x, y, z]; replaces the tool frame for records without orientation), `goal_tool` (the frame that commanded poses are
-    of, where it is not the measured one), `frame_per`, `tool_per`, `robot` (its name).
+    of, where it is not the measured one), `frame_per`, `tool_per`, `robot` (its name), `masses` of the links [kg] and
+    `centres` of these (each [x, y, z] in the frame at the link's end; [] or missing: halfway to the next axis).
 
     Args:
         path: the file.
@@ -84,6 +85,8 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
         parallel_axes=table.groups("parallel_axes", n),
         orientation=orientation,
         goal_tool=goal,
+        masses=table.masses(n),
+        centres=table.centres(n, length),
         leans=[[i, v * angle] for i, v in enumerate(table.numbers("beta", n, default=[0.0] * n), 1) if v],
     )
 
@@ -120,6 +123,25 @@ class _Table:
             got = f"{len(value)}" if isinstance(value, list) else repr(value)
             raise InputError(f"{self.path}: key '{key}' must list {count} numbers, one per joint, got {got}")
         return [_number(v, f"{self.path}: key '{key}', entry {i + 1}") for i, v in enumerate(value)]
+
+    def masses(self, count: int) -> list[float]:
+        """[kg]; none where the file does not tell them."""
+        values = self.numbers("masses", count) if "masses" in self.content else []
+        if values and not min(values) >= 0 < sum(values):
+            raise InputError(f"{self.path}: key 'masses' must list {count} masses [kg] of at least 0, got {values}")
+        return values
+
+    def centres(self, count: int, length: float) -> list[list[float]]:
+        """[m]; empty ones where the file does not tell them."""
+        value = self.content.get("centres", [[]] * count)
+        alone = "centres" in self.content and "masses" not in self.content
+        if alone or not isinstance(value, list) or len(value) != count:
+            raise InputError(f"{self.path}: key 'centres' must list {count} times [x, y, z] or [], beside 'masses'")
+        where = f"{self.path}: key 'centres', entry"
+        for i, one in enumerate(value, 1):
+            if not isinstance(one, list) or len(one) not in (0, 3):
+                raise InputError(f"{where} {i} must be [x, y, z] or [], got {visible(repr(one))}")
+        return [[_number(v, f"{where} {i}") * length for v in one] for i, one in enumerate(value, 1)]
 
     def unit(self, kind: str, known: Mapping[str, float]) -> float:
         units = self.need("units")
@@ -190,6 +212,8 @@ def read_urdf(
     if len(chain) > 2 * MOST_JOINTS:
         raise InputError(f"{path}: the chain has {len(chain)} joints; up to {MOST_JOINTS} that move can be handled")
     links: list[list[float]] = []
+    bodies: list[list[_Body]] = []
+    inertials = {link.get("name"): link.find("inertial") for link in root.findall("link")}
     axes: list[list[float]] = []
     types: list[str] = []
     limits: list[list[float]] = []
@@ -197,7 +221,10 @@ def read_urdf(
     for joint in chain:
         name, kind = joint.get("name", "?"), joint.get("type", "")
         fixed = compose(fixed, _origin(path, joint))
+        body = inertials.get(link_of(path, joint, "child"))
         if kind == "fixed":
+            if bodies and body is not None:
+                bodies[-1].append(_body(path, joint, body, fixed))
             continue
         if kind not in _MOVING or joint.find("mimic") is not None:
             what = "follows another joint (mimic)" if kind in _MOVING else f"is of type '{kind}'"
@@ -209,8 +236,11 @@ def read_urdf(
         types.append(_MOVING[kind])
         limits.append(_limit(path, joint, kind))
         fixed = _IDENTITY
+        bodies.append([] if body is None else [_body(path, joint, body, fixed)])
     if not links:
         raise InputError(f"{path}: the chain has no joint that moves; give base=LINK and tip=LINK")
+    masses = [sum(mass for mass, _ in body) for body in bodies]
+    weighs = any(masses)
     return SerialArm(
         name=visible(root.get("name", Path(path).stem), 60),
         convention="urdf",
@@ -221,6 +251,8 @@ def read_urdf(
         limits=limits,
         unknown_frames=["base", "tool"],
         orientation=orientation,
+        masses=masses if weighs else (),
+        centres=[_centre(body) for body in bodies] if weighs else (),
     )
 
 
@@ -231,6 +263,7 @@ def urdf_joints(path: str) -> list[str]:
 
 
 _Transform = tuple[Tensor, Tensor]
+_Body = tuple[float, Tensor]
 _IDENTITY: _Transform = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
 
@@ -291,8 +324,28 @@ def link_of(path: str, joint: Element, role: str) -> str:
     return name
 
 
-def triple(path: str, joint: Element, tag: str, attribute: str, default: str) -> Tensor:
-    """Three numbers of a joint of a URDF, as they are written."""
+def _body(path: str, joint: Element, inertial: Element, held: _Transform) -> _Body:
+    """Mass [kg] and its centre [m] in the frame of the link that moves, which holds the joint's child so."""
+    name, element = f"link '{link_of(path, joint, 'child')}'", inertial.find("mass")
+    text = "" if element is None else element.get("value", "")
+    try:
+        mass = float(text)
+    except ValueError:
+        mass = math.nan
+    if not 0 <= mass <= LARGEST:
+        raise InputError(f"{path}: {name} needs a mass of at least 0 kg, <mass value=…>, got '{visible(text)}'")
+    return mass, held[0] @ triple(path, inertial, "origin", "xyz", "0 0 0", name) + held[1]
+
+
+def _centre(bodies: list[_Body]) -> list[float]:
+    """Of all of them [m]."""
+    weighed = sum((m * at for m, at in bodies), torch.zeros(3, dtype=torch.float64))
+    found: list[float] = (weighed / max(sum(m for m, _ in bodies), 1e-300)).tolist()
+    return found
+
+
+def triple(path: str, joint: Element, tag: str, attribute: str, default: str, name: str = "") -> Tensor:
+    """Three numbers of a joint of a URDF, as they are written; name: of what is no joint, for a message."""
     element = joint.find(tag)
     text = default if element is None else element.get(attribute, default)
     try:
@@ -301,7 +354,8 @@ def triple(path: str, joint: Element, tag: str, attribute: str, default: str) ->
         values = []
     if len(values) != 3 or not all(abs(v) <= LARGEST for v in values):
         raise InputError(
-            f"{path}: joint '{joint.get('name', '?')}' needs three numbers in {tag} {attribute}, got '{text}'"
+            f"{path}: {name or 'joint ' + repr(joint.get('name', '?'))} needs three numbers in {tag} {attribute}, got "
+            f"'{text}'"
         )
     return torch.tensor(values, dtype=torch.float64)
 

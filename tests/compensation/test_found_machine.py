@@ -49,8 +49,7 @@ def test_its_commands_bring_the_machine_to_the_nominal_pose(found: Path) -> None
     given = {n: v.sign() if n.startswith("direction") else v for n, v in region.covariates.items()}
     answer = model(region.joints.numpy(), torch.stack([given[n] for n in names], -1).numpy())
     exact = torch.from_numpy(answer["status"] < 2)
-    # Corners of the box are out of its reach.
-    assert float(exact.double().mean()) > 0.7
+    assert float(exact.double().mean()) > 0.95
     there = Situation(model.machine.nominal, torch.from_numpy(answer["command"]), given, region.gravity)
     pose = measured_pose(there, reached(there, model.machine.acting, model.machine.values))
     wanted = model.machine.nominal.forward_kinematics(region.joints)
@@ -114,6 +113,20 @@ def test_without_a_machine_it_says_what_to_do(tmp_path: Path) -> None:
         path.write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match=r"diagnosis\.json"):
             load_compensation(path)
+
+
+def test_legs_that_were_moved_far_are_not_drawn_one_by_one() -> None:
+    machine = load_mechanism("stewart")
+    joints = machine.sample_joints(500, torch.Generator().manual_seed(1))
+    middle = joints.mean(0)
+    edges = torch.stack([middle + 1.5 * (joints.amin(0) - middle), middle + 1.5 * (joints.amax(0) - middle)], -1)
+    none = torch.zeros(0, 2, dtype=torch.float64)
+    found = FoundMachine(machine, machine.nominal, [], default_gravity(machine), edges, (), none, {}, {})
+    drawn = found.rows(2000).joints
+    torch.testing.assert_close(torch.stack([drawn.amin(0), drawn.amax(0)], -1), edges, rtol=0, atol=1e-12)
+    # Legs that are drawn one by one turn the platform by up to 2.7 rad, and six in ten of them meet nowhere.
+    turns = machine.forward_kinematics(drawn)[:, 3:].abs().amax(0)
+    assert bool((turns < 2.2 * machine.sample_workspace(500, torch.Generator().manual_seed(1))[:, 3:].amax(0)).all())
 
 
 def test_gravity_of_the_rows_is_that_of_the_machine(found: Path) -> None:

@@ -7,14 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from arm_text import ALPHA, A, D, arm_text
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ccnn_torch.api import identify
 from ccnn_torch.diagnosis import diagnose
+from ccnn_torch.effects import Situation, default_gravity
+from ccnn_torch.effects.registry import make_effect
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms import SerialArm, load_mechanism, read_dh_file
+from ccnn_torch.mechanisms.mechanism_file import dh_text
 from ccnn_torch.records import load_records, write_table
 
 Array = NDArray[np.float64]
@@ -182,3 +186,59 @@ def test_a_torque_in_another_quantity_is_refused(tmp_path: Path) -> None:
     file.write_text(file.read_text().replace("torque_q3[Nm]", "torque_q3[N]", 1))
     with pytest.raises(InputError, match=r"torque_q3.*N\*m"):
         load_records(file, arm, learns=False)
+
+
+@pytest.mark.parametrize("link_frames", [False, True])
+def test_weight_acts_where_the_file_says(tmp_path: Path, link_frames: bool) -> None:
+    centres: list[list[float]] = [[], [], [], [], [], []]
+    masses = [0.0] * 6
+    for link, at, mass in MASSES:
+        centres[link - 1], masses[link - 1] = [float(v) for v in at], mass
+    text = arm_text(f"base_frame: [0, 0, 0.3, 0.2, -0.1, 0.4]\nmasses: {masses}\ncentres: {centres}\n")
+    (tmp_path / "arm.yaml").write_text(text)
+    arm = load_mechanism(str(tmp_path / "arm.yaml"))
+    assert isinstance(arm, SerialArm)
+    (tmp_path / "again.yaml").write_text(dh_text(arm))
+    arm = read_dh_file(str(tmp_path / "again.yaml"))
+    arm = arm.with_link_frames() if link_frames else arm
+    joints = np.random.default_rng(5).uniform(-2, 2, (4, 6))
+    situation = Situation(arm, torch.from_numpy(joints), {}, default_gravity(arm))
+    base = Rotation.from_rotvec([0.2, -0.1, 0.4]).as_matrix()
+
+    def height(q: Array) -> float:
+        links = _links(q, np.zeros((4, 6)))
+        return sum(m * float((base @ links[k][:3] @ [*at, 1])[2]) for k, at, m in MASSES) / sum(masses)
+
+    steps = 1e-5 * np.eye(6)
+    pulls = [[(height(q - one) - height(q + one)) / 2e-5 for one in steps] for q in joints]
+    np.testing.assert_allclose(situation.own_weight_torque, pulls, rtol=0, atol=1e-9)
+
+
+def _two_links(folder: Path, turn: float) -> Situation:
+    """Links of 0.4 and 0.2 m that weigh 3 and 1 kg, turned about x [rad], at 0.3 and 0.5 rad."""
+    links = "a: [400, 200]\nalpha: [0, 0]\nd: [0, 0]\ntheta: [0, 0]\ntool_frame: identity\nmasses: [3, 1]\n"
+    text = f"dof: 2\nconvention: standard Denavit-Hartenberg\nunits: {{length: mm, angle: rad}}\n{links}"
+    (folder / "arm.yaml").write_text(f"{text}base_frame: [0, 0, 0, {turn}, 0, 0]\n")
+    arm = load_mechanism(str(folder / "arm.yaml"))
+    return Situation(arm, torch.tensor([[0.3, 0.5]], dtype=torch.float64), {}, default_gravity(arm))
+
+
+def test_masses_alone_are_halfway_to_the_next_axis(tmp_path: Path) -> None:
+    found = _two_links(tmp_path, np.pi / 2).own_weight_torque[0]
+    far, near = 0.1 * np.cos(0.8), 0.2 * np.cos(0.3)
+    np.testing.assert_allclose(found, [-0.75 * near - 0.25 * (2 * near + far), -0.25 * far], rtol=0, atol=1e-12)
+
+
+def test_a_base_tilts_under_the_moment_of_the_masses(tmp_path: Path) -> None:
+    situation, effect = _two_links(tmp_path, 0.0), make_effect("bending")
+    names = [c.name for c in effect.coefficients(situation)]
+    columns = effect.basis(situation, torch.zeros(0, dtype=torch.float64))[0]
+
+    def place(first: float, second: float) -> Array:
+        return np.array([first * np.cos(0.3) + second * np.cos(0.8), first * np.sin(0.3) + second * np.sin(0.8), 0])
+
+    centre, tool = 0.75 * place(0.2, 0) + 0.25 * place(0.4, 0.1), place(0.4, 0.2)
+    moment = np.cross(centre, [0, 0, -1])
+    for name, tilt in (("x", [moment[0], 0, 0]), ("y", [0, moment[1], 0]), ("xy", [moment[1], moment[0], 0])):
+        wanted = [*np.cross(tilt, tool), *tilt]
+        np.testing.assert_allclose(columns[:, names.index(f"base weight {name}")], wanted, rtol=0, atol=1e-12)

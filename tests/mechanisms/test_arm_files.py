@@ -37,6 +37,15 @@ from ccnn_torch.mechanisms import load_mechanism, read_dh_file, read_urdf
         ("tool_frame: unknown", "tool_frame: [1, 2, 3, 4, 5, x]", "key 'tool_frame', entry 6"),
         ("tool_frame: unknown", "frame_per: robot", "key 'frame_per' must be a list of names"),
         ("tool_frame: unknown", "joint_types: [revolute]", "key 'joint_types' must list 6 times"),
+        ("dof: 6", "dof: 6\nmasses: [1, 1]", "key 'masses' must list 6 numbers, one per joint, got 2"),
+        ("dof: 6", "dof: 6\nmasses: [1, 1, 1, 1, 1, -1]", r"must list 6 masses \[kg\] of at least 0, got"),
+        ("dof: 6", "dof: 6\nmasses: [0, 0, 0, 0, 0, 0]", "key 'masses' must list 6 masses"),
+        ("dof: 6", "dof: 6\ncentres: [[], [], [], [], [], []]", "'centres' must list 6 times .*beside 'masses'"),
+        (
+            "dof: 6",
+            "dof: 6\nmasses: [1, 1, 1, 1, 1, 1]\ncentres: [[], [], [1, 2], [], [], []]",
+            r"key 'centres', entry 3 must be \[x, y, z\] or \[\]",
+        ),
         ("dof: 6", "dof: 6\ndof: 6", "line 3: not valid YAML"),
         ("dof: 6", "dof: [6", "not valid YAML"),
     ],
@@ -85,6 +94,16 @@ def test_tool_offset_replaces_the_tool_for_positions_only(tmp_path):
         ('axis xyz="0 0 2"', 'axis xyz="0 0 0"', "joint 'pan' has the axis 0 0 0"),
         ('<parent link="rail"/>', "", "joint 'slide' lacks <parent"),
         ('lower="-0.4"', 'lower="low"', "joint 'slide' has limits that are no numbers"),
+        (
+            '<link name="plate"/>',
+            '<link name="plate"><inertial><mass value="-1"/></inertial></link>',
+            "link 'plate' needs a mass of at least 0 kg, <mass value=…>, got '-1'",
+        ),
+        (
+            '<link name="fore"/>',
+            '<link name="fore"><inertial><origin xyz="0 a 0"/><mass value="1"/></inertial></link>',
+            "link 'fore' needs three numbers in origin xyz, got '0 a 0'",
+        ),
         ("</robot>", "", "no valid XML"),
     ],
 )
@@ -121,6 +140,27 @@ def test_urdf_branches_ask_for_the_tip(tmp_path):
         read_urdf(str(path), base="world", tip="rail")
     with pytest.raises(InputError, match="there is no such file"):
         read_urdf(str(tmp_path / "no.urdf"))
+
+
+def test_urdf_masses_of_fixed_parts_count_for_the_link_that_moves_them(tmp_path):
+    """Plate and upper are one link: 2 kg at its origin, 1 kg 0.1 m up in the spacer's frame at (0, 0.05, 0.1)."""
+    path = tmp_path / "arm.urdf"
+    assert len(load_mechanism(str(_written(path, URDF))).masses) == 0
+    heavy = URDF.replace('<link name="plate"/>', '<link name="plate"><inertial><mass value="2"/></inertial></link>')
+    one = '<link name="upper"><inertial><origin xyz="0 0 0.1"/><mass value="1"/></inertial></link>'
+    arm = load_mechanism(str(_written(path, heavy.replace('<link name="upper"/>', one))))
+    assert arm.masses.tolist() == [0, 3, 0, 0, 0]
+    joints = torch.tensor([[0.1, 0.4, 0.2, -0.3, 0.5]], dtype=torch.float64)
+    frames = arm.link_frames(joints, arm.nominal)
+    places, shares = arm.weighs(frames, frames[-1][1])
+    wanted = (frames[2][0] @ torch.tensor([0, 0.05 / 3, 0.2 / 3], dtype=torch.float64) + frames[2][1])[0]
+    assert shares.tolist() == [0, 1, 0, 0, 0]
+    torch.testing.assert_close(places[0, 1], wanted, rtol=0, atol=1e-15)
+
+
+def _written(path, text):
+    path.write_text(text)
+    return path
 
 
 def test_urdf_limits_are_the_sampling_box(tmp_path):

@@ -3,10 +3,11 @@
 `python -m ccnn_validation.camera_arm --seed N [--machines N] [--rows N]`. Drawn after the AR4 of Annin Robotics (six
 joints, 0.6 m, stepper motors). A camera reads a cube of markers on the hand in the frame of markers on the table, mean
 of ten images: 0.06 mm and 0.4 mrad across and about its axis, 0.2 mm and 1 mrad along and across it, and 2 % of the
-rows are wrong by millimetres. Of each row the payload and the joints' directions of approach are known. The true
-machine has links of a workshop (0.4 mm, 2 mrad), zeros of stops (6 mrad), eccentric pulleys (50 µm on 40 to 150 mm) and
-planets (four a turn), backlash of planetary gears behind belts, which weight holds on one flank where it exceeds
-friction, joints that give under links and payload, and a table that tilts with the arm's moment about axes of its own.
+rows are wrong by millimetres. The drawing tells the links' masses. Of each row the payload and the joints' directions
+of approach are known. The true machine has links of a workshop (0.4 mm, 2 mrad), zeros of stops (6 mrad), eccentric
+pulleys (50 µm on 40 to 150 mm) and planets (four a turn), backlash of planetary gears behind belts, which weight holds
+on one flank where it exceeds friction, joints that give under links and payload, and a table that tilts with the arm's
+moment about axes of its own.
 Ours (`ccnn run`, by the written file) stands beside a robust SciPy fit of links, pulleys, backlash by direction, joint
 springs and table, alone and with scikit-learn's Gaussian process on what it leaves. Judged are places not measured, in
 the frame and at the point on the hand that suit what is reached best.
@@ -41,7 +42,8 @@ STOP, NEW, G, PAYLOADS = 1e-4, 300, 9.81, (0.0, 0.5, 1.0, 1.5)
 MASSES = (3.0, 2.0, 0.8)
 FILE = """{robot: arm, dof: 6, convention: standard Denavit-Hartenberg, units: {length: mm, angle: deg},
 a: [64.2, 305, 0, 0, 0, 0], alpha: [-90, 0, -90, 90, -90, 0], d: [169.77, 0, 0, 222.63, 0, 36.25],
-theta: [0, 0, 0, 0, 0, 0], base_frame: unknown, tool_frame: unknown}
+theta: [0, 0, 0, 0, 0, 0], base_frame: unknown, tool_frame: unknown,
+masses: [0, 3, 2, 0, 0.8, 0], centres: [[], [], [0, 0, 111.315], [], [], []]}
 """
 
 

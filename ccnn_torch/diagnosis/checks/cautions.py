@@ -215,7 +215,8 @@ def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
                 Caution(
                     f"{atom.name} would have to be {float(size[worst]):.0f} times as large as is plausible "
                     f"({coefficients[worst].name}): check the units; or another cause looks like it, such "
-                    "as a load that acts elsewhere"
+                    "as a load that acts elsewhere",
+                    BESIDE_UNKNOWN,
                 )
             )
     return said

@@ -42,6 +42,8 @@ from ccnn_torch.numerics.rotations import (
 MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
 
+# Keys of a description that is older than these, or has none of them, are not there.
+_WHERE_GIVEN = ("goal_tool", "tables", "leans", "masses", "centres")
 FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
 
@@ -65,6 +67,7 @@ class SerialArm(Closest):
             unit; of i = j joint i is off by that share (lead, gear ratio).
         leans: links (from 1) with a fifth Denavit-Hartenberg parameter, betai [rad], by which the axis at the link's
             end (modified: its own) leans about y of the frame there: Ry(beta) after (modified: before) the others.
+        masses: of the links, `n` [kg]; none where the file does not tell them.
         along_axis: which axis of the frame that a joint carries, from 0, is nearest to the joint's own.
         own_drives: what these and the tables of pitch errors do.
     """
@@ -78,6 +81,8 @@ class SerialArm(Closest):
     _shares: Tensor
     _leaning: Tensor
     counting: Tensor
+    masses: Tensor
+    _centres: Tensor
 
     def __init__(
         self,
@@ -102,6 +107,8 @@ class SerialArm(Closest):
         goal_tool: Sequence[float] | None = None,
         tables: Sequence[Sequence[Sequence[float]] | None] | None = None,
         leans: Sequence[Sequence[float]] = (),
+        masses: Sequence[float] = (),
+        centres: Sequence[Sequence[float]] = (),
     ) -> None:
         """Build from plain numbers [SI].
 
@@ -119,11 +126,14 @@ class SerialArm(Closest):
             unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight, drives: see the class.
             tables: of each joint the places and the errors of its pitch-error table there, or None.
             leans: pairs of a link (from 1), see the class, and its lean [rad].
+            masses: of the links, `n` [kg]; unknown when there are none.
+            centres: of mass of the links, each in the frame at its link's end, `n x 3` [m]; of an empty one halfway
+                from its joint's axis to the next.
             numbers: fields of a `Parameter`, and `of`: what one unit of it adds to links' and drives' parameters, by
                 name; `links` are then what is there without them.
 
         Raises:
-            InputError: unknown convention or orientation.
+            InputError: unknown convention or orientation, or masses that are none.
         """
         every = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         if convention not in LINKS or orientation not in ("rotation_vector", "none", "direction"):
@@ -133,6 +143,8 @@ class SerialArm(Closest):
             )
         if not 1 <= len(links) <= MOST_JOINTS:
             raise InputError(f"arm '{name}': has {len(links)} joints that move; 1 to {MOST_JOINTS} can be handled")
+        if masses and not (len(masses) == len(links) and min(masses) >= 0 < sum(masses)):
+            raise InputError(f"arm '{name}': masses are {len(links)} numbers [kg] of at least 0, one of them above")
         unknown = set(unknown_frames)
         if orientation != "rotation_vector" and tool_offset is not None:
             tool = (0.0,) * 6 if isinstance(tool_offset, str) else (*tool_offset, 0.0, 0.0, 0.0)
@@ -176,9 +188,12 @@ class SerialArm(Closest):
         self.register_buffer("_start", start, persistent=False)
         self.register_buffer("_shares", shares, persistent=False)
         self.register_buffer("_leaning", torch.eye(n).double()[[i - 1 for i in self.leans]], persistent=False)
+        self.register_buffer("masses", torch.tensor(masses, dtype=torch.float64), persistent=False)
+        told = [list(centre) or [math.nan] * 3 for centre in centres or [()] * n]
+        self.register_buffer("_centres", torch.tensor(told, dtype=torch.float64), persistent=False)
         self.register_buffer("counting", counting(convention, n, orientation == "direction"))
-        told = {k: v for k, v in every.items() if v or k not in ("goal_tool", "tables", "leans")}
-        self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(told))}
+        keys = {k: v for k, v in every.items() if v or k not in _WHERE_GIVEN}
+        self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
         self._follow_nominal()
         carried = self.axes
         if self._axis_before:
@@ -241,8 +256,9 @@ class SerialArm(Closest):
         rotations, places = self.link_transforms(zero, self.nominal)
         angles = matrix_to_euler_zyx(rotations).flip(-1)
         links = torch.cat([places, angles], dim=-1)
-        before = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+        before, centres = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)), self._centres
         if self._axis_before:
+            centres = (rotations @ centres.unsqueeze(-1)).squeeze(-1) + places
             links = torch.cat([torch.zeros_like(links[:1]), links[:-1]])
             before = rotations[-1], places[-1]
 
@@ -250,7 +266,9 @@ class SerialArm(Closest):
             turn, place = compose(before, (rotation_vector_to_matrix(frame[3:]), frame[:3]))
             return [*place.tolist(), *matrix_to_rotation_vector(turn).tolist()]
 
-        goal = keys.get("goal_tool")
+        goal, known = keys.get("goal_tool"), {}
+        if "centres" in keys:
+            known["centres"] = [[] if math.isnan(one[0]) else one for one in centres.tolist()]
         return SerialArm(
             **{
                 **keys,
@@ -262,6 +280,9 @@ class SerialArm(Closest):
                 "goal_tool": None if goal is None else from_last(torch.tensor(goal, dtype=torch.float64)),
                 "tool_offset": None,
                 "unknown_frames": list(self.unknown_frames),
+                "centres": [[] if math.isnan(one[0]) else one for one in centres.tolist()]
+                if keys.get("centres")
+                else (),
             }
         )
 
@@ -380,6 +401,20 @@ class SerialArm(Closest):
         for i in range(1, len(self.joints)):
             frames.append(compose(frames[-1], (rotations[..., i, :, :], translations[..., i, :])))
         return frames
+
+    def weighs(self, frames: Sequence[tuple[Tensor, Tensor]], tool: Tensor) -> tuple[Tensor, Tensor]:
+        """Where its links weigh, `... x n x 3` [m], and their shares of the weight, `n` [1]; needs `masses`.
+
+        Args:
+            frames: of the links, `link_frames`.
+            tool: `... x 3` [m], in the same frame.
+        """
+        holders = frames[:-1] if self._axis_before else frames[1:]
+        ends = torch.stack([*(place for _, place in holders), tool], -2)
+        told = torch.nan_to_num(self._centres).unsqueeze(-1)
+        own = [(turn @ centre).squeeze(-1) + at for (turn, at), centre in zip(frames[1:], told, strict=True)]
+        halfway = (ends[..., 1:, :] + ends[..., :-1, :]) / 2
+        return torch.where(self._centres.isnan(), halfway, torch.stack(own, -2)), self.masses / self.masses.sum()
 
     def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Position `... x 3` [m] and rotation `... x 3 x 3` of the tool, also where the pose has no orientation."""
