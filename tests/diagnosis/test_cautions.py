@@ -261,7 +261,7 @@ def test_a_table_of_the_other_convention_is_named() -> None:
     wrong = SerialArm(**{**arm.recipe["keys"], "convention": "modified"})
     joints = arm.sample_joints(40, torch.Generator().manual_seed(0))
     situation = Situation(wrong, joints, {}, default_gravity(wrong))
-    with pytest.raises(InputError, match="table seems to be of the standard Denavit-Hartenberg convention.*leaves"):
+    with pytest.raises(InputError, match=r"table seems to be of the standard Denavit-Hartenberg convention.*leaves"):
         diagnose_rows(situation, arm.forward_kinematics(joints))
 
 

@@ -232,7 +232,7 @@ def _of_model_and_joints(
         yield words, replace(situation, mechanism=mechanism.with_nominal(corrected), parameters=None), measured
     if isinstance(mechanism, SerialArm) and mechanism.convention in _CONVENTIONS:
         other = next(name for name in _CONVENTIONS if name != mechanism.convention)
-        words = f"the model's table seems to be of the {other} Denavit-Hartenberg convention: look at the key of its file"
+        words = f"the model's table seems to be of the {other} Denavit-Hartenberg convention: see its file"
         arm = SerialArm(**{**mechanism.recipe["keys"], "convention": other})
         yield words, replace(situation, mechanism=arm, parameters=None), measured
     at = situation.joints
