@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
+from ccnn_torch.errors import InputError
 from ccnn_torch.numerics.batching import stack_last
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, rotation_vector_to_matrix
 

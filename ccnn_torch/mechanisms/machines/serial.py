@@ -399,12 +399,8 @@ class SerialArm(Closest):
         return frames
 
     def weighs(self, frames: Sequence[tuple[Tensor, Tensor]], tool: Tensor) -> tuple[Tensor, Tensor]:
-        """Where its links weigh, `... x n x 3` [m], and their shares of the weight, `n` [1]; needs `masses`.
-
-        Args:
-            frames: of the links, `link_frames`.
-            tool: `... x 3` [m], in the same frame.
-        """
+        """Where its links weigh, `... x n x 3` [m], and their shares of the weight, `n` [1]; needs `masses`. Given are
+        `link_frames` and the tool `... x 3` [m], both in the arm's own base."""
         holders = frames[:-1] if self._axis_before else frames[1:]
         ends = torch.stack([*(place for _, place in holders), tool], -2)
         told = torch.nan_to_num(self._centres).unsqueeze(-1)
