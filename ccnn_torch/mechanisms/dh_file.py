@@ -132,10 +132,11 @@ class _Table:
         return values
 
     def centres(self, count: int, length: float) -> list[list[float]]:
-        """[m]; empty ones where the file does not tell them."""
-        value = self.content.get("centres", [[]] * count)
-        alone = "centres" in self.content and "masses" not in self.content
-        if alone or not isinstance(value, list) or len(value) != count:
+        """[m]; none, or an empty one, where the file does not tell them."""
+        if "centres" not in self.content:
+            return []
+        value = self.content["centres"]
+        if "masses" not in self.content or not isinstance(value, list) or len(value) != count:
             raise InputError(f"{self.path}: key 'centres' must list {count} times [x, y, z] or [], beside 'masses'")
         where = f"{self.path}: key 'centres', entry"
         for i, one in enumerate(value, 1):

@@ -18,7 +18,7 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge_rows
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 Mistake = Callable[[Situation, Tensor], tuple[Situation, Tensor]]
@@ -253,6 +253,16 @@ def test_angles_of_the_model_in_degrees_are_named() -> None:
     situation = Situation(wrong, joints, {}, default_gravity(wrong))
     with pytest.raises(InputError, match="the angles of the model seem to be in degrees under rad"):
         diagnose_rows(situation, pose)
+
+
+def test_a_table_of_the_other_convention_is_named() -> None:
+    arm = load_mechanism(str(Path(__file__).parents[1] / "effects" / "arm.yaml"))
+    assert isinstance(arm, SerialArm) and arm.convention == "standard"
+    wrong = SerialArm(**{**arm.recipe["keys"], "convention": "modified"})
+    joints = arm.sample_joints(40, torch.Generator().manual_seed(0))
+    situation = Situation(wrong, joints, {}, default_gravity(wrong))
+    with pytest.raises(InputError, match=r"table seems to be of the standard Denavit-Hartenberg convention.*leaves"):
+        diagnose_rows(situation, arm.forward_kinematics(joints))
 
 
 def test_rows_set_aside_that_lie_together_are_no_bad_rows() -> None:

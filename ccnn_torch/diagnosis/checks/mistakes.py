@@ -136,6 +136,7 @@ _LENGTHS = {
     "metres under mm, or the model in millimetres under m": 1e3,
 }
 _ANGLES = {"degrees under rad": 1 / _TURN, "radians under deg": _TURN}
+_CONVENTIONS = ("standard", "modified")
 _POSE = ("x", "y", "z", "rx", "ry", "rz")
 # Share of the usual distance that a fitted frame may leave.
 _LEFT = 0.1
@@ -229,6 +230,11 @@ def _of_model_and_joints(
         corrected = torch.where(turns, inner.nominal / _TURN, inner.nominal)
         words = "the angles of the model seem to be in degrees under rad: look at the units in its file"
         yield words, replace(situation, mechanism=mechanism.with_nominal(corrected), parameters=None), measured
+    if isinstance(mechanism, SerialArm) and mechanism.convention in _CONVENTIONS:
+        other = next(name for name in _CONVENTIONS if name != mechanism.convention)
+        words = f"the model's table seems to be of the {other} Denavit-Hartenberg convention: see its file"
+        arm = SerialArm(**{**mechanism.recipe["keys"], "convention": other})
+        yield words, replace(situation, mechanism=arm, parameters=None), measured
     at = situation.joints
     for i, k in combinations(range(len(joints)), 2):
         if joints[i].unit == joints[k].unit:

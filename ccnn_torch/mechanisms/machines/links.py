@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
+from ccnn_torch.errors import InputError
 from ccnn_torch.numerics.batching import stack_last
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, rotation_vector_to_matrix
 
@@ -188,3 +189,12 @@ def counting(convention: str, count: int, directions: bool) -> Tensor:
         found[:, [k for k, unit in enumerate(units) if unit == "m"]] = 0.0
         found[-1, [k for k, p in enumerate(names) if p in behind]] = 1.0
     return found
+
+
+def weighing(arm: str, masses: Sequence[float], centres: Sequence[Sequence[float]], count: int) -> dict[str, Tensor]:
+    """Masses of an arm's links and their centres, NaN where these are not told."""
+    if masses and not (len(masses) == count and min(masses) >= 0 < sum(masses)):
+        raise InputError(f"arm '{arm}': masses are {count} numbers [kg] of at least 0, one of them above")
+    told = [list(centre) or [math.nan] * 3 for centre in centres or [()] * count]
+    named = {"masses": masses, "_centres": told}
+    return {key: torch.tensor(values, dtype=torch.float64) for key, values in named.items()}

@@ -28,6 +28,7 @@ from ccnn_torch.mechanisms.machines.links import (
     links_and_drives,
     parallel_to_next,
     start_and_shares,
+    weighing,
 )
 from ccnn_torch.mechanisms.pose import Frame
 from ccnn_torch.numerics.batching import stack_last
@@ -143,8 +144,6 @@ class SerialArm(Closest):
             )
         if not 1 <= len(links) <= MOST_JOINTS:
             raise InputError(f"arm '{name}': has {len(links)} joints that move; 1 to {MOST_JOINTS} can be handled")
-        if masses and not (len(masses) == len(links) and min(masses) >= 0 < sum(masses)):
-            raise InputError(f"arm '{name}': masses are {len(links)} numbers [kg] of at least 0, one of them above")
         unknown = set(unknown_frames)
         if orientation != "rotation_vector" and tool_offset is not None:
             tool = (0.0,) * 6 if isinstance(tool_offset, str) else (*tool_offset, 0.0, 0.0, 0.0)
@@ -185,12 +184,9 @@ class SerialArm(Closest):
         self.own_drives = Drives(drives, tables or [None] * n)
         self.drives, self._named = tuple(map(tuple, drives)), bool(numbers)
         self.leans, self._links_size = tuple(int(i) for i, _ in leans), len(start) - len(drives) - len(leans)
-        self.register_buffer("_start", start, persistent=False)
-        self.register_buffer("_shares", shares, persistent=False)
-        self.register_buffer("_leaning", torch.eye(n).double()[[i - 1 for i in self.leans]], persistent=False)
-        self.register_buffer("masses", torch.tensor(masses, dtype=torch.float64), persistent=False)
-        told = [list(centre) or [math.nan] * 3 for centre in centres or [()] * n]
-        self.register_buffer("_centres", torch.tensor(told, dtype=torch.float64), persistent=False)
+        known = {"_start": start, "_shares": shares, "_leaning": torch.eye(n).double()[[i - 1 for i in self.leans]]}
+        for key, value in {**known, **weighing(name, masses, centres, n)}.items():
+            self.register_buffer(key, value, persistent=False)
         self.register_buffer("counting", counting(convention, n, orientation == "direction"))
         keys = {k: v for k, v in every.items() if v or k not in _WHERE_GIVEN}
         self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
@@ -403,12 +399,8 @@ class SerialArm(Closest):
         return frames
 
     def weighs(self, frames: Sequence[tuple[Tensor, Tensor]], tool: Tensor) -> tuple[Tensor, Tensor]:
-        """Where its links weigh, `... x n x 3` [m], and their shares of the weight, `n` [1]; needs `masses`.
-
-        Args:
-            frames: of the links, `link_frames`.
-            tool: `... x 3` [m], in the same frame.
-        """
+        """Where its links weigh, `... x n x 3` [m], and their shares of the weight, `n` [1]; needs `masses`. Given are
+        `link_frames` and the tool `... x 3` [m], both in the arm's own base."""
         holders = frames[:-1] if self._axis_before else frames[1:]
         ends = torch.stack([*(place for _, place in holders), tool], -2)
         told = torch.nan_to_num(self._centres).unsqueeze(-1)
