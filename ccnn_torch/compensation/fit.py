@@ -365,18 +365,15 @@ def machine_parts(
     return {"geometry": geometry, "effects": effects}
 
 
-def geometric_deviation(
-    mechanism: Mechanism, nominal: Tensor, identified: Tensor, guess: Tensor | None = None
-) -> Callable[[Tensor], Tensor]:
+def geometric_deviation(mechanism: Mechanism, nominal: Tensor, identified: Tensor) -> Callable[[Tensor], Tensor]:
     """The exact γ of one or many pairs of geometries.
 
     Args:
         nominal, identified: all parameters, `... x k` [SI], leading dims as the joints' to come.
-        guess: poses near which forward kinematics are solved, `... x p` [SI]; the mechanism's home when None.
     """
 
     def exact(joints: Tensor) -> Tensor:
-        pose = mechanism.forward_kinematics(joints, identified, guess)
+        pose = mechanism.forward_kinematics(joints, identified)
         return mechanism.wrap(mechanism.solve_inverse(pose, nominal, joints) - joints)
 
     return exact

@@ -18,8 +18,8 @@ from ccnn_torch.compensation.kinematics import (
     inverse,
 )
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, mechanism_from_description
-from ccnn_torch.mechanisms.machines.links import compose
-from ccnn_torch.numerics.rotations import rotation_vector_to_matrix, vee
+from ccnn_torch.mechanisms.machines.links import compose, transform_of
+from ccnn_torch.numerics.rotations import vee
 
 # Keeps what is inverted regular in the middle of a singular pose: of what shows how near it is, and of a step [m²].
 _NEAR, _REGULAR = 1e-10, 1e-12
@@ -258,9 +258,9 @@ class Frames(nn.Module):
     def __init__(self, mechanism: Framed, identified: Tensor, inside: ClosedKinematics) -> None:
         super().__init__()
         (base, _, tool), (real_base, _, real_tool) = mechanism.split(mechanism.nominal), mechanism.split(identified)
-        before, after = _transform(real_base), _transform(real_tool)
+        before, after = transform_of(real_base), transform_of(real_tool)
         # Products of two rotations, row by row: rotation and shift.
-        self._out = compose(_backward(_transform(base)), before), compose(after, _backward(_transform(tool)))
+        self._out = compose(_backward(transform_of(base)), before), compose(after, _backward(transform_of(tool)))
         self._in = _backward(self._out[0]), _backward(self._out[1])
         self._turn, self._lever = before[0], after[1]
         # In a tuple, since the polynomial is stored once.
@@ -293,11 +293,6 @@ class Frames(nn.Module):
 
 
 _Transform = tuple[Tensor, Tensor]
-
-
-def _transform(frame: Tensor) -> _Transform:
-    """Rotation and position of a frame of six numbers."""
-    return rotation_vector_to_matrix(frame[3:]), frame[:3]
 
 
 def _backward(by: _Transform) -> _Transform:

@@ -26,10 +26,10 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
-from ccnn_torch.mechanisms.machines.links import compose
+from ccnn_torch.mechanisms.machines.links import compose, transform_of
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector
 from ccnn_torch.units import LARGEST
 
 _FORM = "a mechanism file has mechanism, keys and parameters: {NAME: {value: …, nominal: …, unit: …}}"
@@ -221,8 +221,7 @@ def chain_of(arm: SerialArm) -> tuple[_Frame, list[_Frame], _Frame]:
     values = arm.nominal
     rotations, translations = arm.link_transforms(torch.zeros(n, dtype=torch.float64), values)
     fixed = [(rotations[i], translations[i]) for i in range(n)]
-    base = rotation_vector_to_matrix(values[3:6]), values[:3]
-    tool = rotation_vector_to_matrix(values[-3:]), values[-6:-3]
+    base, tool = transform_of(values[:6]), transform_of(values[-6:])
     if not arm._axis_before:
         return base, fixed, tool
     none = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)

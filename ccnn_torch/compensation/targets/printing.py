@@ -253,7 +253,7 @@ def costs(form: Form) -> list[str]:
     ]
 
 
-def wrapped(lines: list[str], width: int = 96) -> list[str]:
+def wrapped(lines: list[str]) -> list[str]:
     """Sentences in lines of a comment, which no name from a model file can end."""
-    wrapper = textwrap.TextWrapper(width, break_long_words=False, break_on_hyphens=False)
+    wrapper = textwrap.TextWrapper(96, break_long_words=False, break_on_hyphens=False)
     return [part for line in lines for part in (wrapper.wrap(plain(line)) or [""])]

@@ -219,12 +219,11 @@ def fit_frames(
             check_rows_of(arm.name, name, weights[..., group_of == group], needed)
     rotation, position = arm.flange(joints)
     measured = arm.frame(pose)
+    rows = slice(None) if grouped else slice(0, 1)
+    values = arm.nominal.expand(*lead, len(base_of[rows]), -1).clone()
     if arm.orientation == "direction":
         tip = position + (rotation @ arm.nominal[-6:-3, None])[..., 0]
-        bases = _turned(tip, measured[0], weights, base_of, len(base_names))
-        rows = slice(None) if grouped else slice(0, 1)
-        values = arm.nominal.expand(*lead, len(base_of[rows]), -1).clone()
-        values[..., 3:6] = bases[..., base_of[rows], :]
+        values[..., 3:6] = _turned(tip, measured[0], weights, base_of, len(base_names))[..., base_of[rows], :]
         return values if grouped else values[..., 0, :]
     base = arm.nominal[:6].expand(*lead, len(base_names), 6).clone()
     tool = arm.nominal[-6:].expand(*lead, len(tool_names), 6).clone()
@@ -257,8 +256,6 @@ def fit_frames(
         weights.new_zeros(()),
     )
     base, tool = _descend(problem)
-    rows = slice(None) if grouped else slice(0, 1)
-    values = arm.nominal.expand(*lead, len(base_of[rows]), -1).clone()
     values[..., :6], values[..., -6:] = base[..., base_of[rows], :], tool[..., tool_of[rows], :]
     return values if grouped else values[..., 0, :]
 

@@ -12,7 +12,7 @@ from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.fit import best_closed_form, rigid_body_frame, whole_rows
 from ccnn_torch.mechanisms.frames.partial import Around
-from ccnn_torch.mechanisms.machines.links import compose
+from ccnn_torch.mechanisms.machines.links import compose, transform_of
 from ccnn_torch.mechanisms.machines.serial import FRAME
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative
@@ -246,7 +246,7 @@ class Framed(Around):
         position, rotation = self.mechanism.frame(inner_pose)
         if rotation is None:
             return base[..., :3] + (rotation_vector_to_matrix(base[..., 3:]) @ position[..., None])[..., 0]
-        whole = compose(compose(_transform(base), (rotation, position)), _transform(tool))
+        whole = compose(compose(transform_of(base), (rotation, position)), transform_of(tool))
         return _coordinates(whole[1], whole[0])
 
     def unseen(self, pose: Tensor, values: Tensor) -> Frame:
@@ -280,10 +280,6 @@ class Framed(Around):
         found = levenberg_marquardt(gap, expand_leading(start, *data).detach(), data=plain).value
         slope = jacobian_of(lambda point: gap(point, *plain), found)[1]
         return carry_derivative(found, slope, gap(found, *data))
-
-
-def _transform(frame: Tensor) -> tuple[Tensor, Tensor]:
-    return rotation_vector_to_matrix(frame[..., 3:]), frame[..., :3]
 
 
 def _coordinates(position: Tensor, rotation: Tensor | None) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, best_closed_form
 from ccnn_torch.mechanisms.frames.readings import Place, Reading
-from ccnn_torch.mechanisms.machines.links import compose
+from ccnn_torch.mechanisms.machines.links import compose, transform_of
 from ccnn_torch.mechanisms.machines.serial import FRAME, SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.numerics.batching import leading_shape
@@ -153,8 +153,7 @@ def place_with(mechanism: Mechanism, part: Part, joints: Tensor, values: Tensor,
 def place_of(mechanism: Mechanism, link: int | None, joints: Tensor, values: Tensor) -> Place:
     """Where the link is that holds an instrument, or the tool or platform, in the measuring frame."""
     if link is not None and isinstance(mechanism, SerialArm):
-        base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3]
-        rotation, position = compose(base, mechanism.link_frames(joints, values)[link])
+        rotation, position = compose(transform_of(values[..., :6]), mechanism.link_frames(joints, values)[link])
         return Place(position, rotation, joints)
     if isinstance(mechanism, SerialArm):
         return Place(*mechanism.forward_frame(joints, values), joints)

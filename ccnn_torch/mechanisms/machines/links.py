@@ -119,6 +119,11 @@ LINKS: dict[str, tuple[LinkTransform, tuple[str, ...], tuple[str, ...], bool]] =
 }
 
 
+def transform_of(frame: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation and translation of a frame's position and rotation vector, `... x 6` [m, rad]."""
+    return rotation_vector_to_matrix(frame[..., 3:]), frame[..., :3]
+
+
 def compose(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Product of two transforms, each (rotation `... x 3 x 3`, translation `... x 3`)."""
     rotation, translation = first

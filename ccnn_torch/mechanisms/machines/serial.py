@@ -28,6 +28,7 @@ from ccnn_torch.mechanisms.machines.links import (
     links_and_drives,
     parallel_to_next,
     start_and_shares,
+    transform_of,
     weighing,
 )
 from ccnn_torch.mechanisms.pose import Frame
@@ -259,7 +260,7 @@ class SerialArm(Closest):
             before = rotations[-1], places[-1]
 
         def from_last(frame: Tensor) -> list[float]:
-            turn, place = compose(before, (rotation_vector_to_matrix(frame[3:]), frame[:3]))
+            turn, place = compose(before, transform_of(frame))
             return [*place.tolist(), *matrix_to_rotation_vector(turn).tolist()]
 
         goal, known = keys.get("goal_tool"), {}
@@ -412,8 +413,8 @@ class SerialArm(Closest):
         """Position `... x 3` [m] and rotation `... x 3 x 3` of the tool, also where the pose has no orientation."""
         values = self.resolve(parameters)
         base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3] * (self.orientation != "direction")
-        tool = rotation_vector_to_matrix(values[..., -3:]), values[..., -6:-3]
-        rotation, position = compose(compose(base, self.link_frames(joints, values)[-1]), tool)
+        whole = compose(base, self.link_frames(joints, values)[-1])
+        rotation, position = compose(whole, transform_of(values[..., -6:]))
         return position, rotation
 
     def forward_kinematics(
