@@ -87,11 +87,11 @@ class FoundMachine(NamedTuple):
         """
         generator = torch.Generator().manual_seed(0)
         drawn = self.nominal.sample_joints(count, generator)
-        drawn = drawn[torch.isfinite(drawn).all(-1)]
+        drawn = torch.where(torch.isfinite(drawn), drawn, self.nominal.home_joints)
         low, high = drawn.amin(0), drawn.amax(0)
         share = (drawn - low) / (high - low).clamp_min(torch.finfo(drawn.dtype).tiny)
         joints = self.joints[:, 0] + (self.joints[:, 1] - self.joints[:, 0]) * share
-        share = torch.rand(len(drawn), len(self.edges), generator=generator, dtype=torch.float64)
+        share = torch.rand(count, len(self.edges), generator=generator, dtype=torch.float64)
         values = self.edges[:, 0] + (self.edges[:, 1] - self.edges[:, 0]) * share
         given = {c.name: values[:, i] for i, c in enumerate(self.covariates)}
         return Situation(self.nominal, joints, given, self.gravity)

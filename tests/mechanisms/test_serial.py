@@ -12,6 +12,7 @@ from scipy.linalg import null_space
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 
+from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import SerialArm
 
 
@@ -219,3 +220,18 @@ def test_parameter_names_and_frames(tmp_path):
     panda = make("panda", tmp_path)
     assert panda.unknown_frames == () and panda.nominal[-1] == pytest.approx(math.pi / 4)
     assert isinstance(panda, SerialArm)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"masses": [1.0]}, "masses are 2 numbers"),
+        ({"masses": [1.0, math.nan]}, "masses are 2 numbers"),
+        ({"masses": [1.0, math.inf]}, "masses are 2 numbers"),
+        ({"masses": [1.0, 1.0], "centres": [[], [1.0]]}, "centres are 2 times x, y, z"),
+        ({"masses": [1.0, 1.0], "centres": [[]]}, "centres are 2 times x, y, z"),
+    ],
+)
+def test_masses_that_are_none_are_refused(keys, said):
+    with pytest.raises(InputError, match=said):
+        SerialArm("arm", "standard", [[0.4, 0, 0, 0], [0.2, 0, 0, 0]], **keys)

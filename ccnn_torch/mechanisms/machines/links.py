@@ -198,8 +198,10 @@ def counting(convention: str, count: int, directions: bool) -> Tensor:
 
 def weighing(arm: str, masses: Sequence[float], centres: Sequence[Sequence[float]], count: int) -> dict[str, Tensor]:
     """Masses of an arm's links and their centres, NaN where these are not told."""
-    if masses and not (len(masses) == count and min(masses) >= 0 < sum(masses)):
+    if masses and not (len(masses) == count and min(masses) >= 0 < sum(masses) < math.inf):
         raise InputError(f"arm '{arm}': masses are {count} numbers [kg] of at least 0, one of them above")
+    if centres and not (len(centres) == count and all(len(centre) in (0, 3) for centre in centres)):
+        raise InputError(f"arm '{arm}': centres are {count} times x, y, z [m], or nothing")
     told = [list(centre) or [math.nan] * 3 for centre in centres or [()] * count]
     named = {"masses": masses, "_centres": told}
     return {key: torch.tensor(values, dtype=torch.float64) for key, values in named.items()}

@@ -263,9 +263,7 @@ class SerialArm(Closest):
             turn, place = compose(before, transform_of(frame))
             return [*place.tolist(), *matrix_to_rotation_vector(turn).tolist()]
 
-        goal, known = keys.get("goal_tool"), {}
-        if "centres" in keys:
-            known["centres"] = [[] if math.isnan(one[0]) else one for one in centres.tolist()]
+        goal = keys.get("goal_tool")
         return SerialArm(
             **{
                 **keys,
@@ -277,9 +275,7 @@ class SerialArm(Closest):
                 "goal_tool": None if goal is None else from_last(torch.tensor(goal, dtype=torch.float64)),
                 "tool_offset": None,
                 "unknown_frames": list(self.unknown_frames),
-                "centres": [[] if math.isnan(one[0]) else one for one in centres.tolist()]
-                if keys.get("centres")
-                else (),
+                "centres": [[] if math.isnan(one[0]) else one for one in centres.tolist() if "centres" in keys],
             }
         )
 
