@@ -4,7 +4,8 @@
 are bowed, the carriage rolls, pitches and yaws along them, rack and pinion have a scale, a wave and a step; the arm has
 other links than drawn, gives under its own weight and has eccentric encoders. Ours (`ccnn run`, by the written file)
 stands beside a plain SciPy fit of all of that, told the pinion's period, without and with scikit-learn's Gaussian
-process on what it leaves. Judged in the frame and at the tool point that suit what is reached best.
+process on what it leaves. "Ours upright" has the same
+machine by a table whose base stands upright, "ours" one whose base has z along the track. Judged in the frame and at the tool point that suit what is reached best.
 """
 
 from __future__ import annotations
@@ -36,6 +37,14 @@ joint_types: [prismatic, revolute, revolute, revolute, revolute, revolute, revol
 a: [0, 0.26, 0.68, -0.035, 0, 0, 0], alpha: [-90, -90, 0, -90, 90, -90, 0], d: [0, 0.675, 0, 0, 0.67, 0, 0.115],
 theta: [0, 0, 0, 0, 0, 0, 0], masses: [400, 110, 70, 55, 30, 9, 3],
 centres: [[0, 0, 0], [-0.15, 0.2, 0], [-0.36, 0, 0.06], [0.02, 0, 0.1], [0, -0.32, 0], [0, 0, 0.03], [0, 0, -0.03]],
+base_frame: unknown, tool_offset: unknown}
+"""
+# The same machine with the axis z of its base upward, not along the track: a modified table.
+UPRIGHT = """{robot: arm on a track, dof: 7, convention: modified Denavit-Hartenberg, units: {length: m, angle: deg},
+joint_types: [prismatic, revolute, revolute, revolute, revolute, revolute, revolute],
+a: [0, 0, 0.26, 0.68, -0.035, 0, 0], alpha: [90, -90, -90, 0, -90, 90, -90], d: [0, 0.675, 0, 0, 0.67, 0, 0.115],
+theta: [0, 0, 0, 0, 0, 0, 0], masses: [400, 110, 70, 55, 30, 9, 3],
+centres: [[0, 0, 0], [0.11, 0, -0.2], [0.32, 0, 0.06], [-0.015, 0.1, 0], [0, 0, -0.32], [0, 0.03, 0], [0, 0, -0.03]],
 base_frame: unknown, tool_offset: unknown}
 """
 
@@ -157,12 +166,12 @@ def corrected(wanted: Array, flange: Array, joints: Array) -> Array:
     return np.asarray(joints + np.linalg.solve(across @ jacobian + 1e-6 * np.eye(7), across @ miss)[..., 0])
 
 
-def by_package(joints: Array, places: Array, target: Array) -> Array | None:
+def by_package(file: str, joints: Array, places: Array, target: Array) -> Array | None:
     """Commands to the joints wanted, by the written file."""
     names = ",".join(["q1[m]", *(f"q{k}[rad]" for k in range(2, 8))])
     records = f"{names},x[m],y[m],z[m]", np.c_[joints, places]
     with TemporaryDirectory() as folder:
-        return commanded(Path(folder), FILE, records, (names, target))
+        return commanded(Path(folder), file, records, (names, target))
 
 
 def judged(seed: int, rows: int) -> dict[str, float]:
@@ -183,8 +192,9 @@ def judged(seed: int, rows: int) -> dict[str, float]:
             flange = model(numbers, sent[who])
             flange[:, :3, 3] += more
             sent[who] = corrected(wanted, flange, sent[who])
-    commands = by_package(joints, places, target)
-    sent["ours"] = np.full_like(target, np.nan) if commands is None else commands
+    for who, file in (("ours", FILE), ("ours upright", UPRIGHT)):
+        commands = by_package(file, joints, places, target)
+        sent[who] = np.full_like(target, np.nan) if commands is None else commands
     lost = {who: bool(np.isnan(joint).any()) for who, joint in sent.items()}
     return {who: np.nan if lost[who] else missed(wanted, machine.reached(joint)) for who, joint in sent.items()}
 
