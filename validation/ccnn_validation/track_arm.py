@@ -4,8 +4,8 @@
 are bowed, the carriage rolls, pitches and yaws along them, rack and pinion have a scale, a wave and a step; the arm has
 other links than drawn, gives under its own weight and has eccentric encoders. Ours (`ccnn run`, by the written file)
 stands beside a plain SciPy fit of all of that, told the pinion's period, without and with scikit-learn's Gaussian
-process on what it leaves. "Ours upright" has the same
-machine by a table whose base stands upright, "ours" one whose base has z along the track. Judged in the frame and at the tool point that suit what is reached best.
+process on what it leaves. The file of "ours" has the base's axis z along the track, that of "ours upright" upward.
+Judged in the frame and at the tool point that suit what is reached best.
 """
 
 from __future__ import annotations
