@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import force_of, per_force, torque_of
 from ccnn_torch.effects.columns import by_joint, inside, own_parameters
 from ccnn_torch.effects.protocol import Coefficient, Effect
-from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation, arm_axes
 from ccnn_torch.mechanisms import Mechanism, SerialArm, sees_directions
 from ccnn_torch.mechanisms.frames.set_ups import GIVE
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
@@ -45,16 +45,6 @@ def members(mechanism: Mechanism) -> list[Member]:
             found[name] = Member(name, [], leg, joint)
         found[name].lengths.append(k)
     return list(found.values())
-
-
-def arm_axes(arm: SerialArm, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-    """A point on each joint's axis and the axis' direction in the base frame, `... x n x 3` each [m], [1]."""
-    frames = arm.link_frames(joints, values)
-    holders = frames[:-1] if arm._axis_before else frames[1:]
-    base = rotation_vector_to_matrix(values[..., 3:6])
-    points = torch.stack([place for _, place in holders], -2) @ base.mT + values[..., None, :3]
-    axes = (torch.stack([turn for turn, _ in holders], -3) @ arm.axes.unsqueeze(-1)).squeeze(-1) @ base.mT
-    return points, axes
 
 
 def _weights(arm: SerialArm, joints: Tensor, values: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,16 +24,46 @@ WEIGHTS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 _SAMPLES = 128
 # Share of the nominal spread below which coordinates that were shown are those of the rows.
 _FAR_LESS = 0.5
+# Cosine below which two axes are square to each other.
+_SQUARE = 0.1
 # Smallest force or torque of 1 N on a joint [N], [N·m], where gravity does not.
 _LEAST = 0.1
 
 
 def default_gravity(mechanism: Mechanism) -> Tensor:
-    """Along -y for a machine that moves in the x-y plane alone, else along -z; `3` [m/s²], as `Situation` has it."""
+    """Along -y for a machine that moves in the x-y plane alone, else along -z; `3` [m/s²], as `Situation` has it.
+
+    A Denavit-Hartenberg table whose first joint slides has its z along the track; the arm on it stands along its first
+    axis that turns.
+    """
+    if isinstance(mechanism, SerialArm) and (up := _standing(mechanism)) is not None:
+        return -STANDARD_GRAVITY * up
     names = {c.name for c in mechanism.pose}
     flat = "z" not in names and {"x", "y"} <= names
     down = [0.0, -STANDARD_GRAVITY, 0.0] if flat else [0.0, 0.0, -STANDARD_GRAVITY]
     return torch.tensor(down, dtype=torch.float64)
+
+
+def _standing(arm: SerialArm) -> Tensor | None:
+    """The first axis that turns of an arm on a track, `3` [1]: square to the joints that slide before it, and to its
+    own base's z; None for any other arm."""
+    first = next((i for i, turns in enumerate(arm.revolute.tolist()) if turns), 0)
+    if first == 0:
+        return None
+    _, axes = arm_axes(arm, arm.home_joints, arm.nominal)
+    base_z = rotation_vector_to_matrix(arm.nominal[3:6])[:, 2]
+    level = torch.stack([*axes[:first], base_z]) @ axes[first]
+    return axes[first] if bool((level.abs() < _SQUARE).all()) else None
+
+
+def arm_axes(arm: SerialArm, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """A point on each joint's axis and the axis' direction in the base frame, `... x n x 3` each [m], [1]."""
+    frames = arm.link_frames(joints, values)
+    holders = frames[:-1] if arm._axis_before else frames[1:]
+    base = rotation_vector_to_matrix(values[..., 3:6])
+    points = torch.stack([place for _, place in holders], -2) @ base.mT + values[..., None, :3]
+    axes = (torch.stack([turn for turn, _ in holders], -3) @ arm.axes.unsqueeze(-1)).squeeze(-1) @ base.mT
+    return points, axes
 
 
 def has_upright_base(mechanism: Mechanism) -> bool:

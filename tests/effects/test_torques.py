@@ -242,3 +242,25 @@ def test_a_base_tilts_under_the_moment_of_the_masses(tmp_path: Path) -> None:
     for name, tilt in (("x", [moment[0], 0, 0]), ("y", [0, moment[1], 0]), ("xy", [moment[1], moment[0], 0])):
         wanted = [*np.cross(tilt, tool), *tilt]
         np.testing.assert_allclose(columns[:, names.index(f"base weight {name}")], wanted, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("types", "alpha", "down"),
+    [
+        # On a track; with z of the base up already; on a lift; a gantry of two slides under which an arm hangs.
+        (["prismatic", "revolute"], [-90, 0], [0, -1, 0]),
+        (["revolute", "revolute"], [-90, 0], [0, 0, -1]),
+        (["prismatic", "revolute"], [0, 0], [0, 0, -1]),
+        (["prismatic", "prismatic", "revolute"], [90, 90, 0], [0, 0, -1]),
+    ],
+)
+def test_an_arm_on_a_track_stands_along_its_first_axis_that_turns(
+    tmp_path: Path, types: list[str], alpha: list[int], down: list[int]
+) -> None:
+    zero, n = [0] * len(types), len(types)
+    (tmp_path / "arm.yaml").write_text(
+        f"dof: {n}\nconvention: standard Denavit-Hartenberg\nunits: {{length: m, angle: deg}}\njoint_types: {types}\n"
+        f"a: {zero}\nalpha: {alpha}\nd: {zero}\ntheta: {zero}\nbase_frame: identity\ntool_frame: [0.3, 0, 0, 0, 0, 0]\n"
+    )
+    gravity = default_gravity(load_mechanism(str(tmp_path / "arm.yaml")))
+    np.testing.assert_allclose(gravity / 9.80665, down, rtol=0, atol=1e-12)
