@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -37,7 +37,8 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     (+1), `parallel_axes`, `base_frame` and `tool_frame`
     (a text with "unknown", "identity", or [x, y, z, rx, ry, rz]; unknown when missing), `tool_offset` (likewise, but
     [x, y, z]; replaces the tool frame for records without orientation), `goal_tool` (the frame that commanded poses are
-    of, where it is not the measured one), `frame_per`, `tool_per`, `robot` (its name), `masses` of the links [kg] and
+    of, where it is not the measured one), `frame_per`, `tool_per`, `robot` (its name), `limits` of the joints
+    (each [lowest, highest] in the file's units; a full turn or a metre), `masses` of the links [kg] and
     `centres` of these (each [x, y, z] in the frame at the link's end; [] or missing: halfway to the next axis).
 
     Args:
@@ -85,6 +86,7 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
         parallel_axes=table.groups("parallel_axes", n),
         orientation=orientation,
         goal_tool=goal,
+        limits=table.limits(types, length, angle),
         masses=table.masses(n),
         centres=table.centres(n, length),
         leans=[[i, v * angle] for i, v in enumerate(table.numbers("beta", n, default=[0.0] * n), 1) if v],
@@ -123,6 +125,22 @@ class _Table:
             got = f"{len(value)}" if isinstance(value, list) else repr(value)
             raise InputError(f"{self.path}: key '{key}' must list {count} numbers, one per joint, got {got}")
         return [_number(v, f"{self.path}: key '{key}', entry {i + 1}") for i, v in enumerate(value)]
+
+    def limits(self, types: Sequence[str], length: float, angle: float) -> list[list[float]] | None:
+        """Lowest and highest value of each joint [m, rad]; None where the file does not tell them."""
+        if "limits" not in self.content:
+            return None
+        value = self.content["limits"]
+        where = f"{self.path}: key 'limits'"
+        if not isinstance(value, list) or [len(one) if isinstance(one, list) else 0 for one in value] != [2] * len(
+            types
+        ):
+            raise InputError(f"{where} must list {len(types)} times [lowest, highest]")
+        scales = [angle if kind == "revolute" else length for kind in types]
+        found = [[_number(v, where) * s for v in one] for one, s in zip(value, scales, strict=True)]
+        if any(low >= high for low, high in found):
+            raise InputError(f"{where} must have the lowest value of each joint before the highest")
+        return found
 
     def masses(self, count: int) -> list[float]:
         """[kg]; none where the file does not tell them."""

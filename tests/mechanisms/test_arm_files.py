@@ -8,6 +8,7 @@ from catalogue import PANDA, UR10, URDF
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism, read_dh_file, read_urdf
+from ccnn_torch.mechanisms.mechanism_file import dh_text
 
 
 @pytest.mark.parametrize(
@@ -37,6 +38,12 @@ from ccnn_torch.mechanisms import load_mechanism, read_dh_file, read_urdf
         ("tool_frame: unknown", "tool_frame: [1, 2, 3, 4, 5, x]", "key 'tool_frame', entry 6"),
         ("tool_frame: unknown", "frame_per: robot", "key 'frame_per' must be a list of names"),
         ("tool_frame: unknown", "joint_types: [revolute]", "key 'joint_types' must list 6 times"),
+        ("dof: 6", "dof: 6\nlimits: [[0, 1]]", r"key 'limits' must list 6 times \[lowest, highest\]"),
+        (
+            "dof: 6",
+            "dof: 6\nlimits: [[1, 0], [0, 1], [0, 1], [0, 1], [0, 1], [0, 1]]",
+            "lowest value of each joint before",
+        ),
         ("dof: 6", "dof: 6\nmasses: [1, 1]", "key 'masses' must list 6 numbers, one per joint, got 2"),
         ("dof: 6", "dof: 6\nmasses: [1, 1, 1, 1, 1, -1]", r"must list 6 masses \[kg\] of at least 0, got"),
         ("dof: 6", "dof: 6\nmasses: [0, 0, 0, 0, 0, 0]", "key 'masses' must list 6 masses"),
@@ -57,6 +64,18 @@ def test_dh_file_mistakes(tmp_path, old, new, said):
     with pytest.raises(InputError, match=said) as caught:
         load_mechanism(str(path))
     assert "arm.yaml" in str(caught.value)
+
+
+def test_limits_of_a_dh_file_are_the_sampling_box(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text(
+        "dof: 2\nconvention: standard Denavit-Hartenberg\nunits: {length: mm, angle: deg}\na: [0, 300]\n"
+        "alpha: [-90, 0]\nd: [0, 0]\ntheta: [0, 0]\njoint_types: [prismatic, revolute]\nlimits: [[0, 4000], [-90, 45]]\n"
+    )
+    arm = read_dh_file(str(path))
+    assert arm.limits.flatten().tolist() == pytest.approx([0, 4, -1.5707963267948966, 0.7853981633974483])
+    path.write_text(dh_text(arm))
+    assert torch.equal(read_dh_file(str(path)).limits, arm.limits)
 
 
 def test_dh_file_that_is_none(tmp_path):
