@@ -70,7 +70,8 @@ def test_limits_of_a_dh_file_are_the_sampling_box(tmp_path):
     path = tmp_path / "arm.yaml"
     path.write_text(
         "dof: 2\nconvention: standard Denavit-Hartenberg\nunits: {length: mm, angle: deg}\na: [0, 300]\n"
-        "alpha: [-90, 0]\nd: [0, 0]\ntheta: [0, 0]\njoint_types: [prismatic, revolute]\nlimits: [[0, 4000], [-90, 45]]\n"
+        "alpha: [-90, 0]\nd: [0, 0]\ntheta: [0, 0]\njoint_types: [prismatic, revolute]\n"
+        "limits: [[0, 4000], [-90, 45]]\n"
     )
     arm = read_dh_file(str(path))
     assert arm.limits.flatten().tolist() == pytest.approx([0, 4, -1.5707963267948966, 0.7853981633974483])
