@@ -230,7 +230,7 @@ class Machine(nn.Module):
 def limits_of(mechanism: Mechanism) -> tuple[Tensor, Tensor]:
     """Lowest and highest joints of the machine's file, `n` each [SI]; infinite where there are none."""
     none = torch.full((len(mechanism.joints),), math.inf, dtype=torch.float64)
-    if not isinstance(mechanism, SerialArm) or mechanism.recipe["keys"]["limits"] is None:
+    if not isinstance(mechanism, SerialArm) or not mechanism.has_limits:
         return -none, none
     # Exactly a full turn is what a joint without limits is sampled over.
     free = (mechanism.limits.abs() == math.pi).all(-1)

@@ -83,7 +83,7 @@ class DiagnoseConfig(JobConfig):
     gravity: tuple[float, float, float] | None = Field(
         default=None,
         description="gravity in m/s² in the frame of the poses, of an arm with an unknown base frame in its own base; "
-        "null = down along -z (planar machines: -y)",
+        "null = down along -z (planar machines: -y; an arm on a track: against its first axis that turns)",
     )
     network: bool = Field(
         default=True, description="whether to say what a network on the remainder would still gain; takes seconds"

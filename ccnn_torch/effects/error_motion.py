@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects.columns import TWIST, inside, twist_columns
-from ccnn_torch.effects.protocol import Coefficient, Effect
+from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
@@ -46,7 +46,8 @@ class ErrorMotion(Effect):
     Of a sliding joint f_k is Legendre's polynomial of degree k = 1 to 4 of its place in its travel, -1 to 1; of one
     that turns sin q, cos q, sin 2q and cos 2q: once a turn, as a bearing that runs out or an axis that wobbles, and
     twice. o is the origin of the frame that the joint carries, and t and ω are along and about that frame's axes.
-    Shifts in proportion to the travel are leads and squarenesses and no error motion; turns about a joint's own axis
+    The travel is that of the machine's file, or where its rows have been, which are shapes of one value. Shifts in
+    proportion to the travel are leads and squarenesses and no error motion; turns about a joint's own axis
     are an error of its drive. Degrees above 2, and twice a turn, are secondary.
     """
 
@@ -68,19 +69,35 @@ class ErrorMotion(Effect):
             for name, unit in (TWIST[k] for k in motions)
         )
 
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """Where each joint that slides begins and ends, where the machine's file does not tell it."""
+        arm = _arm(situation)
+        every = situation.joints.flatten(0, -2)
+        ends = zip(arm.joints, every.amin(0).tolist(), every.amax(0).tolist(), strict=True)
+        return tuple(
+            Shape(f"{joint.name} {name}", "m", (value,), refined=False)
+            for joint, *found in ends
+            for name, value in zip(("from", "to"), found, strict=True)
+            if joint.unit == "m" and not arm.has_limits
+        )
+
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
         arm = _arm(situation)
         values = arm.resolve(situation.whole.parameters)
         base, frames = rotation_vector_to_matrix(values[..., 3:6]), arm.link_frames(situation.joints, values)
-        low, high = arm.limits.unbind(-1)
+        ends = arm.limits.expand(*shape.shape[:-1], -1, -1)
+        if not arm.has_limits:
+            slides = torch.nonzero(~arm.revolute)[:, 0]
+            ends = ends.index_copy(-2, slides, shape.unflatten(-1, (len(slides), 2)))
+        low, high = ends.unsqueeze(-3).unbind(-1)
         travel = ((2 * situation.joints - low - high) / (high - low).clamp_min(1e-9)).clamp(-1, 1)
         found = []
         for i, joint in enumerate(arm.joints):
             turn, place = frames[i + 1]
             origin = (base @ place[..., None])[..., 0] + values[..., :3]
             twist = twist_columns(situation, situation.platform[0] - origin, base @ turn)
-            at = situation.joints[..., i] if joint.unit == "rad" else travel[..., i]
+            at = situation.joints[..., i].expand_as(travel[..., i]) if joint.unit == "rad" else travel[..., i]
             found += [twist[..., motions] * form.of(at)[..., None, None] for form, motions in _motions(arm, i)]
         return torch.cat(found, -1)
 

@@ -51,9 +51,11 @@ def _standing(arm: SerialArm) -> Tensor | None:
     if first == 0:
         return None
     _, axes = arm_axes(arm, arm.home_joints, arm.nominal)
-    base_z = rotation_vector_to_matrix(arm.nominal[3:6])[:, 2]
-    level = torch.stack([*axes[:first], base_z]) @ axes[first]
-    return axes[first] if bool((level.abs() < _SQUARE).all()) else None
+    base = rotation_vector_to_matrix(arm.nominal[3:6])
+    square = torch.stack([*axes[:first], base[:, 2]]) @ axes[first]
+    if bool((square.abs() >= _SQUARE).any()):
+        return None
+    return axes[first] @ base if has_upright_base(arm) else axes[first]
 
 
 def arm_axes(arm: SerialArm, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:

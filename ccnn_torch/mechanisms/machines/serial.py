@@ -213,6 +213,11 @@ class SerialArm(Closest):
         travel = self.limits.abs().amax(-1)[~self.revolute].sum()
         return float(lengths.norm(dim=-1).sum() + self.nominal[-6:-3].norm() + travel)
 
+    @property
+    def has_limits(self) -> bool:
+        """Whether its file tells the limits of its joints."""
+        return self.recipe["keys"]["limits"] is not None
+
     @cached_property
     def joint_of(self) -> dict[str, str]:
         """The joint before or in each link, by the names of the link's parameters; none where they have own words."""
