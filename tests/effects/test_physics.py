@@ -432,6 +432,25 @@ def test_a_guide_shifts_and_turns_all_that_it_carries_about_where_its_carriage_i
     assert not found["q3 rx 1"][:, :3].any()
 
 
+def test_a_track_without_limits_is_described_over_where_its_rows_have_been() -> None:
+    links = [[0.0, -1.5707963267948966, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0]]
+    arm = SerialArm("track", "standard", links, ["prismatic", "revolute"])
+    joints = torch.tensor([[0.0, 0.3], [1.5, 0.2], [2.0, 0.1], [4.0, 0.0]], dtype=torch.float64)
+    rows, effect = Situation(arm, joints, {}, default_gravity(arm)), make_effect("error_motion")
+    shapes = effect.shapes(rows)
+    assert [(s.name, s.unit, s.grid) for s in shapes] == [("q1 from", "m", (0.0,)), ("q1 to", "m", (4.0,))]
+    ends = torch.tensor([s.grid[0] for s in shapes], dtype=torch.float64)
+    # P2 of u = -1, -0.25, 0, 1.
+    wanted = torch.tensor([1, -0.40625, -0.5, 1], dtype=torch.float64)
+    shift = columns(effect, rows, ends)["q1 x 2"]
+    assert torch.allclose(shift[:, :3].norm(dim=-1), wanted.abs())
+    many = torch.stack([ends, torch.tensor([1.0, 3.0]).double()])
+    assert torch.equal(effect.basis(rows, many)[0], effect.basis(rows, ends))
+    told = SerialArm("track", "standard", links, ["prismatic", "revolute"], limits=[[0, 4], [-1, 1]])
+    other = Situation(told, joints, {}, default_gravity(told))
+    assert effect.shapes(other) == () and torch.equal(effect.basis(other, NO_SHAPE), effect.basis(rows, ends))
+
+
 def test_a_table_that_wobbles_tilts_what_it_carries_across_its_axis(tmp_path: Path) -> None:
     file = tmp_path / "table.yaml"
     file.write_text("machine: five_axis_table_table\n")
