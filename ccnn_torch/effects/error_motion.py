@@ -89,7 +89,7 @@ class ErrorMotion(Effect):
         ends = arm.limits.expand(*shape.shape[:-1], -1, -1)
         if not arm.has_limits:
             slides = torch.nonzero(~arm.revolute)[:, 0]
-            ends = ends.index_copy(-2, slides, shape.unflatten(-1, (len(slides), 2)))
+            ends = ends.index_copy(-2, slides, shape.reshape(*shape.shape[:-1], len(slides), 2))
         low, high = ends.unsqueeze(-3).unbind(-1)
         travel = ((2 * situation.joints - low - high) / (high - low).clamp_min(1e-9)).clamp(-1, 1)
         found = []
