@@ -221,8 +221,8 @@ class RunConfig(JobConfig):
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     refit: bool = Field(
         default=True,
-        description="fit the model that is saved again to all rows of measured records, when it was chosen and judged "
-        "without those held out; not with repeats, nor where split.test names a file",
+        description="fit the model that is saved again to all rows of measured records, and search its effects there, "
+        "when it was chosen and judged without those held out; not with repeats, nor where split.test names a file",
     )
     save_models: bool = Field(default=True, description="write model files and their card")
     save_report: bool = Field(

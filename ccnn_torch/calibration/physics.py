@@ -325,8 +325,8 @@ def moments(records: Records) -> Tensor:
     return elapsed(time) if len(time) and bool(time.isfinite().all()) else torch.arange(len(records)).double()
 
 
-# Rows that the search uses: more take longer and show the same.
-_MOST_ROWS = 1000
+MOST_ROWS = 1000
+"""Rows that the search uses: more take longer and show the same."""
 _EFFECTS = (
     *("joint_gain", "transmission", "backlash", "friction", "compliance", "thermal_compliance", "sag", "gravity"),
     *("bending", "thermal", "coupling", "error_motion", "flexure"),
@@ -352,8 +352,8 @@ def search_effects(
     """
     if isinstance(mechanism, BlackBox):
         return None, ["Effects were not searched: of a simulator every row takes long; see ccnn diagnose."]
-    if len(rows) > _MOST_ROWS:
-        rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]
+    if len(rows) > MOST_ROWS:
+        rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:MOST_ROWS]]
     rows = rows.sort().values
     few = rows_of(records, rows)
     try:

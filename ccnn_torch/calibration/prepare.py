@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -16,6 +17,7 @@ from ccnn_torch.calibration.choice import ModelChoice, choose_model
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.dataset import Dataset, by_repeat, dataset_of
 from ccnn_torch.calibration.physics import (
+    MOST_ROWS,
     Physics,
     fit_physics,
     frames_of_repeats,
@@ -43,13 +45,18 @@ _MOST_JOINTS = 6
 
 
 class Source(NamedTuple):
-    """Measured records and what was chosen for them, with which a model is fitted to any of their rows."""
+    """Measured records and what was chosen for them, with which a model is fitted to any of their rows.
+
+    Attributes:
+        search: looks for effects in some rows, where those of the verdict were found so and more rows may show more.
+    """
 
     mechanism: Mechanism
     records: Records
     settings: dict[str, Any]
     choice: ModelChoice
     verdict: Verdict | None
+    search: Callable[[Tensor], tuple[Verdict | None, list[str]]] | None = None
 
 
 @dataclass(frozen=True)
@@ -237,9 +244,9 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     pose = completed(mechanism, records.joints, records.pose)
     splits = _splits(config, mechanism.frame(pose)[0], records.columns, seeds, held, records.joints)
     settings = _pseudoerror_settings(config, mechanism)
-    choice, verdict, records, said = _choice(config, mechanism, records, splits[0], settings, verdict)
-    notes = [*doubts, *records.notes, *said, choice.why]
-    prepared = _fitted_to(Source(mechanism, records, settings, choice, verdict), splits, seeds)
+    chosen, said = _source(config, mechanism, records, splits[0], settings, verdict)
+    notes = [*doubts, *records.notes, *said, chosen.choice.why]
+    prepared = _fitted_to(chosen, splits, seeds)
     notes = [*held_out_notes(config.split, len(splits[0].test), splits[0]), *notes, *prepared.notes]
     return replace(prepared, notes=notes)
 
@@ -255,15 +262,21 @@ def _unlearnable(mechanism: Mechanism, records: Records) -> str:
 
 
 def over_all_rows(prepared: Prepared) -> Prepared:
-    """The rows of the only repeat with none held out: what was chosen stays, what was fitted is fitted again."""
-    assert prepared.source is not None
-    rows, none = torch.arange(len(prepared.source.records)), torch.zeros(0, dtype=torch.int64)
-    return _fitted_to(prepared.source, [Split(rows, none, none)], prepared.dataset.seeds)
+    """The rows of the only repeat with none held out: what was chosen stays, what was found or fitted is so again."""
+    source = prepared.source
+    assert source is not None
+    rows, none = torch.arange(len(source.records)), torch.zeros(0, dtype=torch.int64)
+    if source.search is not None:
+        verdict, _ = source.search(rows)
+        # A drift of the frame has been taken out of the records.
+        verdict = None if verdict is None else verdict.of_machine()[0]
+        source = source._replace(verdict=verdict if verdict and verdict.effects else source.verdict)
+    return _fitted_to(source, [Split(rows, none, none)], prepared.dataset.seeds)
 
 
 def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepared:
     """Frames, geometry and effects fitted to the rows that are not held out, and what is left to be learned."""
-    mechanism, records, settings, choice, verdict = source
+    mechanism, records, settings, choice, verdict, _ = source
     frames, notes = frames_of_repeats(mechanism, records, splits)
     total = deviations = joint_deviations(mechanism, records.joints, records.pose, parameters=frames, **settings)
     about = (mechanism, records, splits, frames, total.known)
@@ -306,22 +319,22 @@ def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepare
     )
 
 
-def _choice(
+def _source(
     config: RunConfig,
     mechanism: Mechanism,
     records: Records,
     split: Split,
     settings: dict[str, Any],
     verdict: Verdict | None,
-) -> tuple[ModelChoice, Verdict | None, Records, list[str]]:
-    """What `geometry` and `effects` come to for these records, the effects, the records less what is none of the
-    machine, and notes."""
+) -> tuple[Source, list[str]]:
+    """The records less what is none of the machine, with what `geometry` and `effects` come to for them; and notes."""
     notes: list[str] = []
     rows, identify = torch.cat([split.train, split.validation]), config.geometry != "none" and bool(mechanism.geometry)
-    asked = verdict is not None
+    asked, search = verdict is not None, None
     if config.effects != "none" and not asked:
         names = None if isinstance(config.effects, str) else config.effects
-        verdict, notes = search_effects(mechanism, records, rows, names, config.seed, identify)
+        search = partial(search_effects, mechanism, names=names, seed=config.seed, identify=identify)
+        verdict, notes = search(records, rows)
         if config.repeats > 1 and verdict is not None:
             notes.append("They were searched in the training rows of the first repeat, for all repeats.")
     if verdict is not None:
@@ -329,7 +342,11 @@ def _choice(
         asked, notes = asked and verdict is not None, [*notes, *said]
     about = (settings, verdict, asked, _unlearnable(mechanism, records))
     choice = choose_model(config, mechanism, records, split, *about)
-    return choice, verdict if choice.effects else None, records, notes
+    verdict = verdict if choice.effects else None
+    again = None
+    if search is not None and verdict is not None and len(rows) < MOST_ROWS:
+        again = partial(search, records)
+    return Source(mechanism, records, settings, choice, verdict, again), notes
 
 
 def ends_of(config: RunConfig, covariates: Sequence[Coordinate]) -> dict[str, tuple[float, float]]:

@@ -240,7 +240,7 @@ class _Model:
     def labels(self) -> list[tuple[str, str]]:
         """What the coefficients of a group have in common: what they are of, and which part."""
         found = [
-            (k.effect.name, c.by or ("secondary" if c.secondary else ""))
+            (k.effect.name, c.part or ("secondary" if c.secondary else ""))
             for k in self.known
             for c in k.effect.coefficients(self.situation)
         ]
@@ -314,8 +314,7 @@ class _Rows:
     def grams(self, white: Whitening) -> Grams:
         """Inner products of what the frames cannot do."""
         every, seen = self._without_frames(white, torch.cat([self.columns, self.target[..., None]], -1))
-        values = white.count(torch.arange(len(self.fine))) - seen
-        return grams_of(white(every[..., :-1]), white(every[..., -1]))._replace(values=values)
+        return grams_of(white(every[..., :-1]), white(every[..., -1]))._replace(values=white.count() - seen)
 
     def _without_frames(self, white: Whitening, values: Tensor) -> tuple[Tensor, int]:
         """Values `s x c x m` less what the frames can make of them, and how many of these the rows show."""
@@ -328,7 +327,7 @@ class _Rows:
 
     def renewed(self, white: Whitening, fit: Fits, at: Tensor) -> Whitening:
         """Noise and weights from what a fit leaves."""
-        values = max(white.count(torch.nonzero(self.fine).squeeze(-1)), 1.0)
+        values = max(white.count(), 1.0)
         placed = self._without_frames(white, self.target[..., None])[1]
         free = 1 - (float(fit.effective[0]) + placed) / values
         left = white.picked(self.target - self.columns @ at)

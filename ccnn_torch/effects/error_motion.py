@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -16,25 +17,55 @@ from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 
 class _Form(NamedTuple):
-    """How large a motion is along the way of a joint: of -1 to 1 over its travel, or of its angle [rad]."""
+    """How large a motion is along the way of a joint: of -1 to 1 over its travel, or of its angle [rad].
+
+    Attributes:
+        name: as coefficients name it.
+        of: the motion, 1 at its largest.
+        size: how large it is likely to be beside the others.
+        secondary, part: as of `Coefficient`.
+    """
 
     name: str
     of: Callable[[Tensor], Tensor]
+    size: float
     secondary: bool
+    part: str
 
 
-# Legendre's polynomials of the degrees 1 to 4.
-_SLIDES = (
-    _Form("1", lambda u: u, False),
-    _Form("2", lambda u: 1.5 * u**2 - 0.5, False),
-    _Form("3", lambda u: (2.5 * u**2 - 1.5) * u, True),
-    _Form("4", lambda u: (4.375 * u**2 - 3.75) * u**2 + 0.375, True),
-)
-_TURNS = (
-    _Form("sin", torch.sin, False),
-    _Form("cos", torch.cos, False),
-    _Form("sin 2", lambda q: torch.sin(2 * q), True),
-    _Form("cos 2", lambda q: torch.cos(2 * q), True),
+def _legendre(degree: int) -> Callable[[Tensor], Tensor]:
+    """Legendre's polynomial by Bonnet's recursion."""
+
+    def of(u: Tensor) -> Tensor:
+        before, here = torch.ones_like(u), u
+        for k in range(2, degree + 1):
+            before, here = here, ((2 * k - 1) * u * here - (k - 1) * before) / k
+        return here
+
+    return of
+
+
+# Highest degree over a travel: of rails of 4 m screwed down every 0.6 m with some to spare. Halves and quarters of it
+# have sizes of their own: how smooth a rail is, is asked of the rows.
+_DEGREES = 16
+
+
+def _slide(degree: int) -> _Form:
+    """As large as of a path whose slope is random: the mean square falls with the square of the degree."""
+    part = "waves" if 4 < degree <= _DEGREES // 2 else "short waves" if degree > 4 else ""
+    return _Form(str(degree), _legendre(degree), math.sqrt(2 * degree + 1) / degree, degree > 2, part)
+
+
+_SLIDES = tuple(_slide(degree) for degree in range(1, _DEGREES + 1))
+# Bearings and rails are not made alike.
+_TURNS = tuple(
+    _Form(name, of, 1.0, secondary, "turning")
+    for name, of, secondary in (
+        ("sin", torch.sin, False),
+        ("cos", torch.cos, False),
+        ("sin 2", lambda q: torch.sin(2 * q), True),
+        ("cos 2", lambda q: torch.cos(2 * q), True),
+    )
 )
 # Of machine tools as built over a metre [m], [rad] (ISO 10791-1); the rows say what it is here.
 _SIZE = {"m": 1e-5, "rad": 2e-5}
@@ -43,7 +74,7 @@ _SIZE = {"m": 1e-5, "rad": 2e-5}
 class ErrorMotion(Effect):
     """Δx = Σ f_k(q) (t_k + ω_k × (x - o)), ΔR = Σ f_k(q) ω_k: error motions of axes (ISO 230-1:2012, 3.4; ISO 230-7).
 
-    Of a sliding joint f_k is Legendre's polynomial of degree k = 1 to 4 of its place in its travel, -1 to 1; of one
+    Of a sliding joint f_k is Legendre's polynomial of degree k = 1 to 16 of its place in its travel, -1 to 1; of one
     that turns sin q, cos q, sin 2q and cos 2q: once a turn, as a bearing that runs out or an axis that wobbles, and
     twice. o is the origin of the frame that the joint carries, and t and ω are along and about that frame's axes.
     The travel is that of the machine's file, or where its rows have been, which are shapes of one value. Shifts in
@@ -63,7 +94,14 @@ class ErrorMotion(Effect):
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Of each joint the shifts and turns of its first form, then of the next."""
         return tuple(
-            Coefficient(f"{joint.name} {name} {form.name}", unit, _SIZE[unit], joint.name, secondary=form.secondary)
+            Coefficient(
+                f"{joint.name} {name} {form.name}",
+                unit,
+                _SIZE[unit] * form.size,
+                joint.name,
+                secondary=form.secondary,
+                part=form.part,
+            )
             for i, joint in enumerate(_arm(situation).joints)
             for form, motions in _motions(_arm(situation), i)
             for name, unit in (TWIST[k] for k in motions)

@@ -30,8 +30,8 @@ class Coefficient:
             one.
         mends: whether it is but a correction of the form of the others, and cannot be many times as large as they are.
         positive: whether physics allows it no negative value (backlash, compliance); for drawing it in a simulation.
-        by: name of a covariate beyond the effect's own that alone drives it: it may be there without the other
-            secondary ones; empty = none.
+        part: name of a part of the effect that may be there or not for itself, with a size of its own: growth by a
+            second thermometer, short waves of a rail; empty = none.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Coefficient:
     borrowed: bool = False
     mends: bool = False
     positive: bool = False
-    by: str = ""
+    part: str = ""
 
 
 @dataclass(frozen=True)

@@ -205,7 +205,7 @@ class Thermal(Effect):
             ]
         following = found[: 1 + len(_apart(mechanism)) + sum(j.unit == "m" for j in mechanism.joints)]
         found += [
-            replace(c, name=f"{c.name} {name.partition('_')[2]}", secondary=True, positive=False, by=name)
+            replace(c, name=f"{c.name} {name.partition('_')[2]}", secondary=True, positive=False, part=name)
             for name in _thermometers(situation)
             for c in following
         ]
