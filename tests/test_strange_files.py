@@ -90,6 +90,12 @@ def test_yaml_in_other_encodings(tmp_path: Path, cli: Cli) -> None:
     assert "1 MB" in told(cli("run", tmp_path / "c.yaml"))
 
 
+def test_who_changes_what_was_read_changes_it_for_nobody_else() -> None:
+    first = parse_yaml("a: {b: [1, 2]}", "text")
+    first["a"]["b"].append(3)
+    assert parse_yaml("a: {b: [1, 2]}", "text") == {"a": {"b": [1, 2]}}
+
+
 def test_what_stands_twice_is_written_twice() -> None:
     shared = [1, 2]
     assert parse_yaml(dump_yaml({"a": shared, "b": shared}), "dump") == {"a": [1, 2], "b": [1, 2]}
