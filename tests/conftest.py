@@ -5,6 +5,7 @@ One thread: the tensors are small, and threads of two processes would wait for e
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 import sys
@@ -16,6 +17,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
+import typer.main
 from matplotlib.figure import Figure
 
 from ccnn_torch.cli import main
@@ -27,6 +29,8 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # 700 new objects, Python's own threshold, are made by one operation on tensors, and by a line of a test that is read.
 gc.set_threshold(50_000, 10, 10)
+# A process runs one command, and the tests a thousand: typer reads the signatures of all commands for each.
+typer.main.get_command = functools.cache(typer.main.get_command)
 
 
 def pytest_collection_finish() -> None:

@@ -106,7 +106,7 @@ def arm(tmp_path: Path, tool: str = "unknown") -> SerialArm:
     return machine
 
 
-def path_of(machine: SerialArm, rows: int = 12) -> tuple[torch.Tensor, Array]:
+def path_of(machine: SerialArm, rows: int = 6) -> tuple[torch.Tensor, Array]:
     """Joints of a walk from home, and the flange's poses there."""
     steps = 0.15 * torch.randn(rows, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     joints = machine.home_joints + steps.cumsum(0)
@@ -166,7 +166,7 @@ def test_an_arms_joints_are_those_with_which_its_errors_fit(tmp_path: Path) -> N
 
 def test_what_was_commanded_is_refused_by_row(tmp_path: Path) -> None:
     machine = arm(tmp_path)
-    _, pose = path_of(machine)
+    _, pose = path_of(machine, 12)
     place = {f"{c}[m]": pose[:, k] for k, c in enumerate("xyz")}
     goals = {f"goal_{name}": values for name, values in place.items()}
     turns = {f"goal_{c}[rad]": pose[:, k + 3] for k, c in enumerate(("rx", "ry", "rz"))}
@@ -187,7 +187,7 @@ def test_what_was_commanded_is_refused_by_row(tmp_path: Path) -> None:
     lacking = {name: values for name, values in (goals | turns).items() if name != "goal_z[m]"}
     refused(lacking | place, "there is no column 'goal_z'")
     # Joints count where a file has them.
-    joints = {f"q{k + 1}[rad]": path_of(machine)[0][:, k].numpy() for k in range(6)}
+    joints = {f"q{k + 1}[rad]": path_of(machine, 12)[0][:, k].numpy() for k in range(6)}
     write_table(file, far | place | joints)
     assert np.array_equal(load_records(file, machine, learns=False).joints[:, 0].numpy(), joints["q1[rad]"])
 

@@ -11,7 +11,8 @@ groups that are alone need no matrix at all, and of a set its widest group is le
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -273,8 +274,11 @@ def _to_begin_with(parts: _Parts, there: Array, yy: Array, prior: Prior) -> tupl
 
 def _total(values: Array) -> Array:
     """Sum over the last dimension; a product with ones is the fastest sum of short rows."""
-    total: Array = values @ np.ones(values.shape[-1])
+    total: Array = values @ _ones(values.shape[-1])
     return total
+
+
+_ones: Callable[[int], Array] = cache(np.ones)
 
 
 @np.errstate(all="ignore")  # what is 0 or beyond all numbers is clipped

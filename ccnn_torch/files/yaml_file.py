@@ -6,7 +6,9 @@ all memory, and tags (`!!set`) make types that no key takes.
 
 from __future__ import annotations
 
+import copy
 import io
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,12 @@ def parse_yaml(text: str, where: str) -> Any:
     Raises:
         InputError: it is no YAML, or more than its plain part.
     """
+    return copy.deepcopy(_parsed(text, where))
+
+
+# The file of an arm is read as three kinds, and anew by every step of a command.
+@lru_cache(16)
+def _parsed(text: str, where: str) -> Any:
     # The pure-Python loader: the C one reads YAML 1.1.
     yaml = YAML(typ="safe", pure=True)
     try:

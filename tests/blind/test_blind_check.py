@@ -17,6 +17,7 @@ from ccnn_validation.blind.explain import Judge
 from ccnn_validation.blind.folder import BlindFolder
 from ccnn_validation.blind.generator import judge_cases, open_cases, write_cases
 from ccnn_validation.blind.judge import judged
+from ccnn_validation.blind.plan import CasePlan
 from ccnn_validation.blind.report import share, summary
 from ccnn_validation.blind.simulate import simulate
 from ccnn_validation.blind.tables import blind_markdown
@@ -36,11 +37,18 @@ def beside(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccnn_validation.blind.check._generator", lambda what, folder: sides[what](folder))
 
 
+@pytest.fixture
+def fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the library explains of a case is fitted for the first answer and known for the others."""
+    known: dict[CasePlan, Judge] = {}
+    monkeypatch.setattr("ccnn_validation.blind.judge.Judge", lambda case: known.setdefault(case.plan, Judge(case)))
+
+
 def check(out: Path, diagnose: StandIn, cases: int = 6) -> Path:
     return run_blind_check(cases, out, diagnose, seed=5, machines=("five_bar",), quiet=True)
 
 
-@pytest.mark.usefixtures("beside")
+@pytest.mark.usefixtures("beside", "fitted_once")
 def test_who_knows_the_truth_is_right_and_who_does_not_is_not(tmp_path: Path) -> None:
     ignorant = StandIn(otherwise=Said(("drift",)))
     path = check(tmp_path / "a", ignorant)
@@ -161,6 +169,7 @@ def test_classes_are_what_the_rows_cannot_tell_apart() -> None:
     assert len(Judge(weak).members(["compliance"])) > 8
 
 
+@pytest.mark.usefixtures("fitted_once")
 def test_answers_are_judged() -> None:
     (pair,) = simulate([replace(planned("five_bar", "pair", "backlash", "drift", rows=100), strength=3.0)], 0)
 

@@ -14,7 +14,6 @@ from frozen import frozen
 from ccnn_torch.diagnosis import Diagnosis, diagnose, diagnose_rows
 from ccnn_torch.diagnosis.checks.identifiable import check_rows
 from ccnn_torch.diagnosis.engine import candidates
-from ccnn_torch.diagnosis.verdict.text import verdict_text
 from ccnn_torch.effects import Situation, default_gravity, make_effect
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
@@ -253,12 +252,3 @@ def test_the_numbers_of_an_effect_are_not_shared_with_one_that_cannot_be_told_fr
     entry = next(e for e in found.effects if e["name"] == "backlash")
     assert found.verdict["effects"] == ["backlash"] and entry["indistinguishable_from"] == ["friction"]
     assert entry["parameters"]["q4"]["value"] == pytest.approx(9e-5, rel=0.05)
-
-
-def test_a_cause_is_told_as_a_fact_only_where_it_is_nearly_sure() -> None:
-    situation = rows_of("five_bar", 60, 1)
-    found = diagnose_rows(situation, measured(situation, {"joint_offset": 10.0}, 2), effects=["joint_offset"])
-    results = plain(found.to_json())
-    for probability, words in ((0.94, "is the likeliest explanation"), (0.96, "explains it")):
-        results["verdict"]["probability"] = probability
-        assert words in verdict_text(results)

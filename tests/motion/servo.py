@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
+from scipy.integrate import odeint
 
 Array = NDArray[np.float64]
 GAIN, INERTIA, VISCOUS = 2.0, 0.004, 0.09
@@ -39,6 +39,11 @@ def between(time: Array, values: Array) -> Callable[[float], float]:
         return known[k - 1] + share * (known[k] - known[k - 1])
 
     return value
+
+
+def integrated(rate: Callable[[float, Array], list[float]], begin: list[float], time: Array) -> Array:
+    """States at the times: LSODA as of `solve_ivp`, whose steps in Python take longer than the equation."""
+    return np.asarray(odeint(rate, begin, time, rtol=1e-6, atol=1e-8, hmax=0.01, tfirst=True))
 
 
 def moved(
@@ -71,9 +76,7 @@ def moved(
         torque = motor - (viscous - drive) * v - weight * math.sin(q) - cube * q**3 - dry * math.tanh(v / 0.002)
         return [v, (torque - teeth * math.sin(84 * q)) / INERTIA, error]
 
-    begin = [asked[0], 0.0, 0.0]
-    found = solve_ivp(rate, (time[0], time[-1]), begin, "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)
-    return np.asarray(found.y[0])
+    return integrated(rate, [asked[0], 0.0, 0.0], time)[:, 0]
 
 
 def moved_on_a_spring(time: Array, asked: Array, spring: float, damping: float, at_motor: bool) -> Array:
@@ -86,9 +89,7 @@ def moved_on_a_spring(time: Array, asked: Array, spring: float, damping: float, 
         torque = GAIN * (wanted(t) - q) - VISCOUS * v - pull
         return [v, torque / (INERTIA - LOAD), w, (pull - MASS * 9.80665 * LENGTH * math.sin(x)) / LOAD]
 
-    begin = [asked[0], 0.0, asked[0], 0.0]
-    found = solve_ivp(rate, (time[0], time[-1]), begin, "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)
-    return np.asarray(found.y[0 if at_motor else 2])
+    return integrated(rate, [asked[0], 0.0, asked[0], 0.0], time)[:, 0 if at_motor else 2]
 
 
 def write_log(

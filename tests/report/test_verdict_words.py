@@ -32,6 +32,13 @@ def test_a_verdict_is_two_sentences_with_its_figures(name: str) -> None:
         assert [low, high] == pytest.approx([100 * v for v in verdict["shrink_ci95"]], abs=0.51)
 
 
+def test_a_cause_is_told_as_a_fact_only_where_it_is_nearly_sure() -> None:
+    results = one_effect()[0]
+    for probability, words in ((0.94, "is the likeliest explanation"), (0.96, "explains it")):
+        results["verdict"]["probability"] = probability
+        assert words in verdict_text(results)
+
+
 def test_the_verdict_of_each_kind() -> None:
     assert verdict_text(one_effect()[0]) == (
         "The gap of 420 µm is 20 times the noise. Joint compliance under load explains it (probability 0.98) and would "
