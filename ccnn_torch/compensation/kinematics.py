@@ -27,12 +27,6 @@ _LOST, _STEEPEST = 1e9, 1e6
 _NOTHING = 1e-15
 
 
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross product of `... x 3`, without an operation that a file lacks."""
-    next_, last = [1, 2, 0], [2, 0, 1]
-    return a[..., next_] * b[..., last] - a[..., last] * b[..., next_]
-
-
 def gauss_jordan(matrix: Tensor, right: Tensor) -> Tensor:
     """Solution of a positive definite `... x n x n`, right `... x n x c`: without pivoting, unrolled."""
     table = torch.cat([matrix, right], dim=-1)
@@ -297,7 +291,7 @@ class Links(nn.Module):
         ends = torch.stack(chain, dim=-3)
         rotations, lever = ends[..., :3, :3], chain[-1][..., None, :3, 3] - ends[..., :3, 3]
         spins = (rotations @ self._spins)[..., 0]
-        linear = (rotations @ self._shifts)[..., 0] + cross(spins, lever)
+        linear = (rotations @ self._shifts)[..., 0] + torch.linalg.cross(spins, lever, dim=-1)
         rotation = chain[-1][..., :3, :3] if self._turned else None
         if coupled is not None:
             linear, spins = coupled.mT @ linear, coupled.mT @ spins
