@@ -130,29 +130,21 @@ class Fields(nn.Module):
 
     def describe(self) -> dict[str, Any]:
         """Everything `from_description` needs; the tensors are stored beside it."""
-        about: dict[str, Any] = {"layout": [[name, list(shape)] for name, shape in self.layout]}
-        if isinstance(self.source, ChebyshevExpansion):
-            about["degree"] = self.source.degree
-        elif isinstance(self.source, ClosedKinematics):
-            about["start"] = None if self.source.start is None else self.source.start.degree
-        return about
+        polynomial = self.source.start if isinstance(self.source, ClosedKinematics) else self.source
+        degree = polynomial.degree if isinstance(polynomial, ChebyshevExpansion) else None
+        return {"layout": [[name, list(shape)] for name, shape in self.layout], "degree": degree}
 
     @classmethod
     def from_description(cls, description: dict[str, Any], mechanism: Mechanism) -> Fields:
         """Fields of the described shape, their tensors without meaning."""
         layout = [(name, tuple(shape)) for name, shape in description["layout"]]
-        outputs, n = sum(math.prod(shape) for _, shape in layout), len(mechanism.joints)
+        n, degree, closed = len(mechanism.joints), description["degree"], mechanism.closed_form is not None
         blank = torch.ones(n, dtype=torch.float64)
-
-        def polynomial(degree: int, count: int) -> ChebyshevExpansion:
-            return ChebyshevExpansion(blank.clone(), blank.clone(), degree, outputs=count)
-
-        source: nn.Module | None = None
-        if "degree" in description:
-            source = polynomial(description["degree"], outputs)
-        elif "start" in description:
-            degree = description["start"]
-            source = ClosedKinematics(mechanism, None if degree is None else polynomial(degree, len(mechanism.pose)))
+        polynomial: ChebyshevExpansion | None = None
+        if degree is not None:
+            outputs = len(mechanism.pose) if closed else sum(math.prod(shape) for _, shape in layout)
+            polynomial = ChebyshevExpansion(blank.clone(), blank.clone(), degree, outputs=outputs)
+        source = ClosedKinematics(mechanism, polynomial) if layout and closed else polynomial
         sizes = {"typical_torque": n, "low": n, "high": n, "down": 3}
         constants = {k: torch.ones(v, dtype=torch.float64) for k, v in sizes.items()}
         samples = Situation(mechanism, blank[None], {}, torch.zeros(3, dtype=torch.float64)).samples
