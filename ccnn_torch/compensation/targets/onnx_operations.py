@@ -106,8 +106,10 @@ class ByTensors(Lowering):
         def change(tensor: Tensor) -> Any:
             return node.target(tensor, *rest, **kwargs)  # type: ignore[operator]
 
+        if name == "squeeze":
+            return self._shaped(change, value, rest[0] % len(value.shape))
         if name in _SHAPED:
-            return self._shaped(change, value if "squeeze" in name else self.graph.full(value))
+            return self._shaped(change, value if name == "unsqueeze" else self.graph.full(value))
         if name in _PERMUTED:
             return self._permuted(change, value)
         if name in _PICKED:
@@ -180,12 +182,14 @@ class ByTensors(Lowering):
 
     # What only moves elements.
 
-    def _shaped(self, change: Callable[[Tensor], Tensor], value: Value) -> Value:
-        """Of another shape, as torch makes one out of it."""
+    def _shaped(self, change: Callable[[Tensor], Tensor], value: Value, less: int | None = None) -> Value:
+        """Of another shape, as torch makes one out of it; less: the one axis that it then lacks."""
         solid = self.graph.solid(value)
         shape, real = (tuple(change(torch.empty(n, device="meta")).shape) for n in (solid.shape, solid.real))
         if shape == solid.shape:
             return solid
+        if less is not None:
+            return self.graph.node("Squeeze", [solid.name, self.graph.whole([less])], shape, real)
         sizes = self.graph.whole(batch_of(real, self.graph.rows))
         return self.graph.node("Reshape", [solid.name, sizes], shape, real)
 
