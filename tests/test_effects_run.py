@@ -159,7 +159,7 @@ def test_a_run_from_the_command_line_and_its_files(cli: Cli, tmp_path: Path) -> 
     assert pose["after"]["rms"]["median"] < 1.3 * 2**0.5 * NOISE < 0.2 * pose["before"]["rms"]["median"]
     assert "effects + constant removes" in (out / "results.md").read_text(encoding="utf-8")
     card = json.loads((out / "card.json").read_text(encoding="utf-8"))
-    assert card["format"] == "ccnn_torch compensator 6"
+    assert card["format"] == "ccnn_torch compensator 7"
     assert set(card["machine"]["effects"]["numbers"]) == {"joint_gain"}
     # The effect looks at no column, so that the model asks for none.
     assert card["covariates"] == []

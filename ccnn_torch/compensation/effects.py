@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.compensation.expansions import ChebyshevExpansion, TrigonometricExpansion, expand, expand_arm
+from ccnn_torch.compensation.expansions import ChebyshevExpansion, expand
 from ccnn_torch.compensation.kinematics import ClosedKinematics, inverse
 from ccnn_torch.effects import Acting, Situation, labelled, make_effect
 from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
@@ -65,8 +65,9 @@ class Fields(nn.Module):
 
     Attributes:
         layout: name and shape of each quantity.
-        source: a module from joints `... x n` to the quantities side by side, `... x o` [SI], or a `ClosedKinematics`,
-            which gives them by name; None where none is read.
+        source: a polynomial from joints `... x n` to the quantities side by side, `... x o` [SI], or a
+            `ClosedKinematics`, which gives them by name; None of an arm, which has them in closed form itself, and
+            where none is read.
         typical_torque, low, high, down: what a `Situation` takes from the workspace and from gravity.
     """
 
@@ -111,6 +112,9 @@ class Fields(nn.Module):
 
     def values(self, joints: Tensor, names: set[str]) -> dict[str, Tensor]:
         """Some of the quantities at joints `s x n`, each `s x shape`."""
+        machine = self._samples[0].mechanism
+        if isinstance(machine, SerialArm):
+            return _of_arm(machine, joints, names)
         if self.source is None:
             return {}
         if isinstance(self.source, ClosedKinematics):
@@ -126,37 +130,34 @@ class Fields(nn.Module):
 
     def describe(self) -> dict[str, Any]:
         """Everything `from_description` needs; the tensors are stored beside it."""
-        about: dict[str, Any] = {"layout": [[name, list(shape)] for name, shape in self.layout]}
-        if isinstance(self.source, TrigonometricExpansion):
-            about["turns"] = self.source.turns
-        elif isinstance(self.source, ChebyshevExpansion):
-            about["degree"] = self.source.degree
-        elif isinstance(self.source, ClosedKinematics):
-            about["start"] = None if self.source.start is None else self.source.start.degree
-        return about
+        polynomial = self.source.start if isinstance(self.source, ClosedKinematics) else self.source
+        degree = polynomial.degree if isinstance(polynomial, ChebyshevExpansion) else None
+        return {"layout": [[name, list(shape)] for name, shape in self.layout], "degree": degree}
 
     @classmethod
     def from_description(cls, description: dict[str, Any], mechanism: Mechanism) -> Fields:
         """Fields of the described shape, their tensors without meaning."""
         layout = [(name, tuple(shape)) for name, shape in description["layout"]]
-        outputs, n = sum(math.prod(shape) for _, shape in layout), len(mechanism.joints)
+        n, degree, closed = len(mechanism.joints), description["degree"], mechanism.closed_form is not None
         blank = torch.ones(n, dtype=torch.float64)
-
-        def polynomial(degree: int, count: int) -> ChebyshevExpansion:
-            return ChebyshevExpansion(blank.clone(), blank.clone(), degree, outputs=count)
-
-        source: nn.Module | None = None
-        if "turns" in description:
-            source = TrigonometricExpansion(description["turns"], outputs)
-        elif "degree" in description:
-            source = polynomial(description["degree"], outputs)
-        elif "start" in description:
-            degree = description["start"]
-            source = ClosedKinematics(mechanism, None if degree is None else polynomial(degree, len(mechanism.pose)))
+        polynomial: ChebyshevExpansion | None = None
+        if degree is not None:
+            outputs = len(mechanism.pose) if closed else sum(math.prod(shape) for _, shape in layout)
+            polynomial = ChebyshevExpansion(blank.clone(), blank.clone(), degree, outputs=outputs)
+        source = ClosedKinematics(mechanism, polynomial) if layout and closed else polynomial
         sizes = {"typical_torque": n, "low": n, "high": n, "down": 3}
         constants = {k: torch.ones(v, dtype=torch.float64) for k, v in sizes.items()}
         samples = Situation(mechanism, blank[None], {}, torch.zeros(3, dtype=torch.float64)).samples
         return cls(layout, source, constants, samples)
+
+
+def _of_arm(arm: SerialArm, joints: Tensor, names: set[str]) -> dict[str, Tensor]:
+    """What a `Situation` makes the others of; an arm's pose, from which it has these itself, is no closed form."""
+    if not names:
+        return {}
+    unit = torch.eye(arm.compared, dtype=joints.dtype)
+    found = {"jacobian": arm.jacobian(joints), "frame_slope": unit.expand(len(joints), -1, -1)}
+    return found | ({"parameter_jacobian": arm.parameter_jacobian(joints)} if "parameter_jacobian" in names else {})
 
 
 def make_fields(mechanism: Mechanism, gravity: Tensor, names: set[str], joints: Tensor, margin: float) -> Fields:
@@ -167,7 +168,7 @@ def make_fields(mechanism: Mechanism, gravity: Tensor, names: set[str], joints: 
         joints: commanded joints of the training rows, `s x n` [SI].
 
     Raises:
-        InputError, MethodFailedError: as `expand` and `expand_arm`.
+        InputError, MethodFailedError: as `expand`.
     """
 
     def quantities(points: Tensor) -> dict[str, Tensor]:
@@ -194,14 +195,14 @@ def make_fields(mechanism: Mechanism, gravity: Tensor, names: set[str], joints: 
     constants = {"typical_torque": whole.typical_torque, "low": low, "high": high, "down": whole.down}
     layout = [(name, tuple(value.shape[1:])) for name, value in quantities(joints[:2]).items()]
     source: nn.Module | None = None
-    if layout and isinstance(mechanism, SerialArm):
-        source = expand_arm(flat, [joint.unit == "rad" for joint in mechanism.joints], _WHAT)
-    elif layout and mechanism.closed_form is not None:
+    if not layout or isinstance(mechanism, SerialArm):
+        pass
+    elif mechanism.closed_form is not None:
         start = None
         if mechanism.closed_form == "inverse":
             start = expand(lambda q: Situation(mechanism, q, {}, gravity).pose, joints, margin, _WHAT, worst=_START)
         source = ClosedKinematics(mechanism, start)
-    elif layout:
+    else:
         groups = [math.prod(shape) for _, shape in layout]
         source = expand(flat, joints, margin, _WHAT, groups, _OF_EFFECT)
     return Fields(layout, source, constants, whole.samples)

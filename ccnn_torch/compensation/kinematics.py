@@ -15,8 +15,8 @@ from ccnn_torch.numerics.rotations import homogeneous, rotation_vector_to_matrix
 
 # Of central differences of the fourth order [SI]: machines are about 1 m, and their kinematics are curved by about 1/m.
 _STEP = 5e-4
-# From a polynomial that is off by some hundredths at most, and by 1e-4 mostly.
-_NEWTON_STEPS = 4
+# From a polynomial that is off by some hundredths at most, and by 1e-4 mostly, with the derivative there.
+_NEWTON_STEPS = 8
 # What is left of the inverse kinematics where a pose was found [SI].
 _FOUND = 1e-9
 # How far a further step may move the pose of one that has settled [m, rad].
@@ -25,12 +25,6 @@ _SETTLED = 1e-13
 _LOST, _STEEPEST = 1e9, 1e6
 # Cosines of a right angle and their products with lengths: rounding [1 or m], and as zeros they cost nothing.
 _NOTHING = 1e-15
-
-
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross product of `... x 3`, without an operation that a file lacks."""
-    next_, last = [1, 2, 0], [2, 0, 1]
-    return a[..., next_] * b[..., last] - a[..., last] * b[..., next_]
 
 
 def gauss_jordan(matrix: Tensor, right: Tensor) -> Tensor:
@@ -202,19 +196,8 @@ class ClosedKinematics(nn.Module):
             reachable = torch.isfinite(pose).all(-1, keepdim=True)
             joints = torch.where(reachable, joints, mechanism.home_joints)
             return joints, torch.where(reachable, pose, mechanism.home_pose), reachable
-        pose = self.start(joints).detach()
-        for _ in range(_NEWTON_STEPS):
-            pose = self._newton(pose, joints).detach()
-        # A comparison with NaN is false.
-        reachable = ((mechanism.solve_inverse(pose) - joints).abs() < _FOUND).all(-1, keepdim=True)
-        joints = torch.where(reachable, joints, mechanism.home_joints)
-        # The last step has the derivative by the joints.
-        return joints, self._newton(torch.where(reachable, pose, mechanism.home_pose), joints), reachable
-
-    def _newton(self, pose: Tensor, joints: Tensor) -> Tensor:
-        inverse = self._mechanism[0].solve_inverse
-        step = _pseudo_inverse(_slope(inverse, pose)) @ (inverse(pose) - joints).unsqueeze(-1)
-        return pose - step.squeeze(-1)
+        pose, reachable = self.standing(joints, _NEWTON_STEPS)
+        return torch.where(reachable, joints, mechanism.home_joints), pose, reachable
 
 
 def _slope(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
@@ -297,7 +280,7 @@ class Links(nn.Module):
         ends = torch.stack(chain, dim=-3)
         rotations, lever = ends[..., :3, :3], chain[-1][..., None, :3, 3] - ends[..., :3, 3]
         spins = (rotations @ self._spins)[..., 0]
-        linear = (rotations @ self._shifts)[..., 0] + cross(spins, lever)
+        linear = (rotations @ self._shifts)[..., 0] + torch.linalg.cross(spins, lever, dim=-1)
         rotation = chain[-1][..., :3, :3] if self._turned else None
         if coupled is not None:
             linear, spins = coupled.mT @ linear, coupled.mT @ spins

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm, sees_directions
-from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
 from ccnn_torch.units import STANDARD_GRAVITY
@@ -320,22 +319,25 @@ class Situation:
         arm = self.mechanism
         assert isinstance(arm, SerialArm)
         values = arm.resolve(self.parameters)
-        down = (rotation_vector_to_matrix(values[..., 3:6]).mT @ self.down.unsqueeze(-1)).squeeze(-1)
-
-        def height(joints: Tensor) -> Tensor:
-            frames = arm.link_frames(joints, values)
-            rotation, flange = frames[-1]
-            tool = flange + (rotation @ values[..., -6:-3, None]).squeeze(-1)
-            if len(arm.masses):
-                places, share = arm.weighs(frames, tool)
-            else:
-                places = torch.stack([*(place for _, place in frames[1:]), tool], -2)
-                share = torch.ones(places.shape[-2], dtype=places.dtype)
-            share = share * heavy(torch.linspace(0, 1, len(share), dtype=places.dtype))
-            down_there: Tensor = share @ (places @ down.unsqueeze(-1)) / share.sum()
-            return down_there
-
-        return jacobian_of(height, self.joints)[1].squeeze(-2).detach()
+        frames, base = arm.link_frames(self.joints, values), rotation_vector_to_matrix(values[..., 3:6])
+        rotation, flange = frames[-1]
+        tool = flange + (rotation @ values[..., -6:-3, None]).squeeze(-1)
+        if len(arm.masses):
+            places, share = arm.weighs(frames, tool)
+        else:
+            places = torch.stack([*(place for _, place in frames[1:]), tool], -2)
+            share = torch.ones(places.shape[-2], dtype=places.dtype)
+        share = share * heavy(torch.linspace(0, 1, len(share), dtype=places.dtype))
+        points, axes = arm_axes(arm, self.joints, values)
+        # What a joint moves: links from its own on.
+        onward = torch.ones(points.shape[-2], len(share), dtype=places.dtype).triu() * share / share.sum()
+        moved = onward.sum(-1)
+        lever = onward @ (places @ base.mT + values[..., None, :3]) - moved[:, None] * points
+        turned, slid = torch.linalg.cross(axes, lever, dim=-1), moved[:, None] * axes
+        rates = torch.where(arm.revolute[:, None], turned, slid) * arm.signs[:, None]
+        torque: Tensor = (rates @ self.down.unsqueeze(-1)).squeeze(-1)
+        coupled = arm.coupled(self.joints, values)
+        return torque if coupled is None else (coupled.mT @ torque.unsqueeze(-1)).squeeze(-1)
 
     @cached_property
     def down(self) -> Tensor:

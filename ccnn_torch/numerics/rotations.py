@@ -106,15 +106,15 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
 
 def skew(vector: Tensor) -> Tensor:
     """Matrix of the cross product: vector `... x 3`; returns `... x 3 x 3` with `skew(a) @ b = a x b`."""
-    x, y, z = vector.unbind(-1)
+    x, y, z = torch.split(vector, 1, -1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*vector.shape, 3)
+    return torch.cat([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape, 3)
 
 
 def vee(matrix: Tensor) -> Tensor:
     """Inverse of `skew`, of the skew part of a matrix: `... x 3 x 3`; returns `... x 3`."""
-    odd = (matrix - matrix.transpose(-1, -2)) / 2
-    return torch.stack([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]], dim=-1)
+    flat = matrix.flatten(-2)
+    return (flat[..., [7, 2, 3]] - flat[..., [5, 6, 1]]) / 2
 
 
 def rotation_vector_rate(vector: Tensor) -> Tensor:

@@ -298,8 +298,8 @@ def test_a_file_of_an_earlier_version_says_what_to_do(copied: Path) -> None:
     path = copied / "model.safetensors"
     with safe_open(path, framework="pt") as file:
         text = file.metadata()["ccnn_torch"]
-    for version in (1, 5, 60):
-        older = text.replace("ccnn_torch compensator 6", f"ccnn_torch compensator {version}")
+    for version in (1, 6, 60):
+        older = text.replace("ccnn_torch compensator 7", f"ccnn_torch compensator {version}")
         save_file(load_file(path), path, metadata={"ccnn_torch": older})
         vouch(path)
         with pytest.raises(ModelFileError, match=rf"compensator {version}' of another version.*write it again"):

@@ -229,6 +229,14 @@ def test_masses_alone_are_halfway_to_the_next_axis(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, [-0.75 * near - 0.25 * (2 * near + far), -0.25 * far], rtol=0, atol=1e-12)
 
 
+def test_a_lift_carries_all_of_its_link() -> None:
+    lift = SerialArm(
+        "lift", "standard", [[0] * 4, [0.2, 0, 0, 0]], joint_types=["prismatic", "revolute"], masses=[3, 1]
+    )
+    found = Situation(lift, torch.tensor([[0.3, 0.5]], dtype=torch.float64), {}, default_gravity(lift))
+    np.testing.assert_allclose(found.own_weight_torque, [[-1, 0]], rtol=0, atol=1e-15)
+
+
 def test_a_base_tilts_under_the_moment_of_the_masses(tmp_path: Path) -> None:
     situation, effect = _two_links(tmp_path, 0.0), make_effect("bending")
     names = [c.name for c in effect.coefficients(situation)]

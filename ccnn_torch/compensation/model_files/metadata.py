@@ -93,7 +93,7 @@ def run_onnx(session: onnxruntime.InferenceSession, joints: Array, covariates: A
     return dict(zip(names, session.run(names, feeds), strict=True))
 
 
-FORMAT = f"{_FORMATS}6"
+FORMAT = f"{_FORMATS}7"
 
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]

@@ -102,6 +102,8 @@ class Lowering(ABC):
         if not any(map(self.is_value, tree_leaves((args, kwargs)))):
             with torch.no_grad():
                 return node.target(*args, **kwargs)  # type: ignore[operator]
+        if node.meta.get("val") is not None and not node.meta["val"].numel():
+            return node.meta["val"]
         kwargs = {key: value for key, value in kwargs.items() if key not in _IGNORED}
         if name in _SAME:
             return args[-1] if name == "copy" else args[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -102,8 +101,20 @@ class ByTensors(Lowering):
         return graph.node("Gather", [solid.name, graph.whole(places.tolist())], shape, shape, axis=dim)
 
     def moved(self, node: Node, args: Any, kwargs: Any) -> Any:
-        move = _MOVES.get(operation_of(node))
-        return None if move is None else move(self, *args, **kwargs)
+        name, (value, *rest) = operation_of(node), args
+
+        def change(tensor: Tensor) -> Any:
+            return node.target(tensor, *rest, **kwargs)  # type: ignore[operator]
+
+        if name == "squeeze":
+            return self._shaped(change, value, rest[0] % len(value.shape))
+        if name in _SHAPED:
+            return self._shaped(change, value if name == "unsqueeze" else self.graph.full(value))
+        if name in _PERMUTED:
+            return self._permuted(change, value)
+        if name in _PICKED:
+            return self._parts(change, value)
+        return _MOVES[name](self, *args, **kwargs) if name in _MOVES else None
 
     def clamped(self, value: Any, low: Any = None, high: Any = None, **named: Any) -> Any:
         low, high = named.get("min", low), named.get("max", high)
@@ -171,40 +182,35 @@ class ByTensors(Lowering):
 
     # What only moves elements.
 
-    def _reshaped(self, value: Value, shape: Sequence[int]) -> Value:
-        shape, solid = [*shape], self.graph.full(value)
-        if -1 in shape:
-            shape[shape.index(-1)] = math.prod(solid.shape) // -math.prod(shape)
-        if shape == [*solid.shape]:
+    def _shaped(self, change: Callable[[Tensor], Tensor], value: Value, less: int | None = None) -> Value:
+        """Of another shape, as torch makes one out of it; less: the one axis that it then lacks."""
+        solid = self.graph.solid(value)
+        shape, real = (tuple(change(torch.empty(n, device="meta")).shape) for n in (solid.shape, solid.real))
+        if shape == solid.shape:
             return solid
-        sizes = self.graph.whole(batch_of(shape, self.graph.rows))
-        return self.graph.node("Reshape", [solid.name, sizes], shape, shape)
+        if less is not None:
+            return self.graph.node("Squeeze", [solid.name, self.graph.whole([less])], shape, real)
+        sizes = self.graph.whole(batch_of(real, self.graph.rows))
+        return self.graph.node("Reshape", [solid.name, sizes], shape, real)
 
-    def _unsqueezed(self, value: Value, dim: int) -> Value:
+    def _permuted(self, change: Callable[[Tensor], Tensor], value: Value) -> Value:
         solid = self.graph.solid(value)
-        at = dim % (len(solid.shape) + 1)
-        shape, real = ([*sizes[:at], 1, *sizes[at:]] for sizes in (solid.shape, solid.real))
-        names = [solid.name, self.graph.whole([at])]
-        return self.graph.node("Unsqueeze", names, shape, real)
-
-    def _squeezed(self, value: Value, dim: int) -> Value:
-        if value.shape[dim] != 1:
-            return value
-        solid = self.graph.solid(value)
-        at = dim % len(solid.shape)
-        shape, real = ([*sizes[:at], *sizes[at + 1 :]] for sizes in (solid.shape, solid.real))
-        return self.graph.node("Squeeze", [solid.name, self.graph.whole([at])], shape, real)
-
-    def _permuted(self, value: Value, order: Sequence[int]) -> Value:
-        solid = self.graph.solid(value)
-        order = [d % len(solid.shape) for d in order]
+        # Lengths that tell the axes apart.
+        order = [n - 2 for n in change(torch.empty([k + 2 for k in range(len(solid.shape))], device="meta")).shape]
         shape, real = ([sizes[d] for d in order] for sizes in (solid.shape, solid.real))
         return self.graph.node("Transpose", [solid.name], shape, real, perm=order)
 
-    def _transposed(self, value: Value, a: int = -2, b: int = -1) -> Value:
-        order = [*range(len(value.shape))]
-        order[a], order[b] = order[b], order[a]
-        return self._permuted(value, order)
+    def _parts(self, change: Callable[[Tensor], Any], value: Value) -> Any:
+        """Elements along each axis: which they are is seen by what becomes of their numbers."""
+        found: list[Any] = []
+        for dim, length in enumerate(value.shape):
+            at = torch.arange(length).reshape(-1, *[1] * (len(value.shape) - dim - 1)).expand(value.shape)
+            moved = change(at)
+            several = isinstance(moved, list | tuple)
+            each = moved if several else [moved]
+            places = [part.movedim(dim, 0).flatten(1)[:, 0] if part.dim() > 1 else part for part in each]
+            found = [self.picked(v, dim, p) for v, p in zip(found or [value] * len(each), places, strict=True)]
+        return found if several else found[0]
 
     def _selected(self, value: Value, dim: int, index: int) -> Value:
         solid = self.graph.full(value)
@@ -212,20 +218,6 @@ class ByTensors(Lowering):
         shape = [n for k, n in enumerate(solid.shape) if k != dim]
         at = self.graph.whole(index % solid.shape[dim])
         return self.graph.node("Gather", [solid.name, at], shape, shape, axis=dim)
-
-    def _sliced(self, value: Value, dim: int = 0, start: Any = None, end: Any = None, step: int = 1) -> Any:
-        dim %= len(value.shape)
-        return self.picked(value, dim, torch.arange(value.shape[dim])[slice(start, end, step)])
-
-    def _indexed(self, value: Value, indices: Sequence[Any]) -> Any:
-        used = [k for k, index in enumerate(indices) if index is not None]
-        assert len(used) == 1 and indices[used[0]].dim() == 1, "elements are picked along one axis"
-        return self.picked(value, used[0], indices[used[0]].remainder(value.shape[used[0]]))
-
-    def _flipped(self, value: Value, dims: Sequence[int]) -> Value:
-        for dim in dims:
-            value = self.picked(value, dim % len(value.shape), torch.arange(value.shape[dim]).flip(0))
-        return value
 
     def _joined(self, parts: Sequence[Any], dim: int = 0) -> Value:
         graph, rank = self.graph, len(parts[0].shape)
@@ -242,24 +234,18 @@ class ByTensors(Lowering):
 
     def _stacked(self, parts: Sequence[Any], dim: int = 0) -> Value:
         dim %= len(parts[0].shape) + 1
-        return self._joined(
-            [self._unsqueezed(p, dim) if isinstance(p, Value) else p.unsqueeze(dim) for p in parts], dim
-        )
+        ahead = [
+            self._shaped(lambda v: v.unsqueeze(dim), p) if isinstance(p, Value) else p.unsqueeze(dim) for p in parts
+        ]
+        return self._joined(ahead, dim)
 
     def _expanded(self, value: Value, shape: Sequence[int]) -> Value:
         solid = self.graph.solid(value)
         more = len(shape) - len(solid.shape)
         wanted = tuple(solid.shape[k - more] if n == -1 else n for k, n in enumerate(shape))
-        for _ in range(more):
-            # So that names and shapes agree in rank.
-            solid = self._unsqueezed(solid, 0)
+        # So that names and shapes agree in rank.
+        solid = self._shaped(lambda v: v.reshape(*[1] * more, *v.shape), solid)
         return Value(wanted, solid.name, solid.real)
-
-    def _split(self, value: Value, sizes: Any, dim: int = 0) -> list[Any]:
-        length = value.shape[dim]
-        sizes = [min(sizes, length - k) for k in range(0, length, sizes)] if isinstance(sizes, int) else sizes
-        ends = np.cumsum(sizes)
-        return [self._sliced(value, dim, int(end - n), int(end)) for n, end in zip(sizes, ends, strict=True)]
 
     def _unbound(self, value: Value, dim: int = 0) -> list[Value]:
         return [self._selected(value, dim, k) for k in range(value.shape[dim])]
@@ -273,12 +259,12 @@ def _alike(value: Any) -> float | None:
     return flat[0].item() if len(flat) and bool((flat == flat[0]).all()) else None
 
 
+_SHAPED, _PERMUTED = (
+    frozenset({"view", "_unsafe_view", "unsqueeze", "squeeze"}),
+    frozenset({"permute", "transpose", "t"}),
+)
+_PICKED = frozenset({"slice", "index", "index_select", "flip", "split", "split_with_sizes"})
 _MOVES: dict[str, Callable[..., Any]] = {
-    "view": ByTensors._reshaped, "_unsafe_view": ByTensors._reshaped, "unsqueeze": ByTensors._unsqueezed,
-    "squeeze": ByTensors._squeezed, "permute": ByTensors._permuted, "transpose": ByTensors._transposed,
-    "t": ByTensors._transposed, "select": ByTensors._selected,
-    "slice": ByTensors._sliced, "index": ByTensors._indexed,
-    "index_select": lambda own, v, dim, places: own.picked(v, dim % len(v.shape), places),
-    "flip": ByTensors._flipped, "cat": ByTensors._joined, "stack": ByTensors._stacked, "expand": ByTensors._expanded,
-    "split": ByTensors._split, "split_with_sizes": ByTensors._split, "unbind": ByTensors._unbound,
+    "select": ByTensors._selected, "cat": ByTensors._joined, "stack": ByTensors._stacked,
+    "expand": ByTensors._expanded, "unbind": ByTensors._unbound,
 }  # fmt: skip

@@ -450,7 +450,7 @@ class SerialArm(Closest):
         # A point on the axis gives the lever arm of a revolute joint; a prismatic one only moves along its axis.
         swept = torch.linalg.cross(axes, tip[..., None, :] - torch.stack([f[1] for f in holders], dim=-2), dim=-1)
         turning, signs = self.revolute[:, None], self.signs[:, None]
-        return torch.where(turning, swept, axes) * signs, axes * turning * signs
+        return torch.where(turning, swept, axes) * signs, axes * (turning * signs)
 
     def _by_own(self, columns: Tensor, rates: Tensor, joints: Tensor) -> Tensor:
         """Columns of the parameters between the frames, `... x k x 3`, from those of links and leans `... x l x 3` and
