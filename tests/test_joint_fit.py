@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.joint_fit import JointFit, effects_that_pay, fit_jointly
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, reached
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 NOISE = 2e-5
@@ -123,6 +123,10 @@ def test_rows_that_are_not_used_change_nothing() -> None:
     first = fit_jointly(situation, pose, [], used, range(48)).parameters
     pose[110] += 1.0
     torch.testing.assert_close(fit_jointly(situation, pose, [], used, range(48)).parameters, first, rtol=0, atol=0)
+    # They are no values from which noise or the size of what is fitted is known, either.
+    few = Situation(situation.mechanism, situation.joints[used], {}, situation.gravity)
+    there = fit_jointly(few, pose[used], [], torch.ones(100) > 0, range(48)).parameters
+    torch.testing.assert_close(first, there, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("turning", [range(6), range(1)], ids=["all legs", "one leg"])
@@ -163,3 +167,30 @@ def test_growth_by_one_more_thermometer_stays_without_what_else_is_secondary() -
     assert {"growth", "link 3 motor"} <= {names[k] for k in found.used} and "reference" not in {
         names[k] for k in found.used
     }
+
+
+@pytest.mark.parametrize("wave", [2.4, 0.9, None])
+def test_how_smooth_a_rail_is_is_asked_of_the_rows(wave: float | None) -> None:
+    """A track of 4 m on rails with waves, long or short, or on straight ones."""
+    links = [[0.0, -1.5707963267948966, 0.0, 0.0], [0.5, 0.0, 0.3, 0.0], [0.4, 0.0, 0.0, 0.0]]
+    limits = [[0.0, 4.0], [-2.0, 2.0], [-2.0, 2.0]]
+    arm = SerialArm("track", "standard", links, ["prismatic", "revolute", "revolute"], limits=limits)
+    drawn = torch.Generator().manual_seed(7)
+    joints = arm.sample_joints(200, drawn)
+    situation = Situation(arm, joints, {}, default_gravity(arm))
+    pose = reached(situation, [])
+    if wave is not None:
+        along = joints[:, :1] * 2 * torch.pi / wave + torch.arange(6)
+        shift, turn = (2e-4 * torch.sin(along)).split(3, -1)
+        carriage = joints[:, :1] * torch.tensor([0.0, 0.0, 1.0])
+        place = pose[:, :3] + shift + torch.linalg.cross(turn, pose[:, :3] - carriage)
+        turned = rotation_vector_to_matrix(turn) @ rotation_vector_to_matrix(pose[:, 3:])
+        pose = torch.cat([place, matrix_to_rotation_vector(turned)], -1)
+    pose = pose + NOISE * torch.randn(200, 6, generator=drawn, dtype=torch.float64)
+    effect, fine = make_effect("error_motion"), torch.ones(200) > 0
+    loose = range(len(arm.geometry))
+    known = effects_that_pay(situation, pose, [effect], fine, loose)
+    parts = {effect.coefficients(situation)[k].part for one in known for k in one.used}
+    assert parts == {2.4: {"", "waves"}, 0.9: {"", "waves", "short waves"}, None: set()}[wave]
+    left = pose - reached(situation, *fit_jointly(situation, pose, known, fine, loose))
+    assert float(left[:, :3].square().mean().sqrt()) < 1.2 * NOISE

@@ -75,7 +75,7 @@ def fitted_whitening(
     y = white.picked(residual)
     shown = [white.picked(c).to(residual.dtype) for c in columns if c.shape[-1]]
     shown = shown if seen is None else [c * seen[..., None] for c in shown]
-    count = float(y.numel()) if seen is None else float(seen.sum())
+    count = white.count(torch.nonzero(usable)[:, 0])
     if noise is None:
         white = replace(white, sigma=(white.usual(y, usable) * MAD).clamp_min(NO_NOISE))
     candidates = _Everything(shown, white)
@@ -87,7 +87,8 @@ def fitted_whitening(
     for _ in range(_LARGEST):
         if chosen:
             own = torch.cat([shown[k] / candidates.size[k] for k in chosen], -1)
-            grams, groups = grams_of(white.scaled(own), white.scaled(y)), groups_of(shown[k] for k in chosen)
+            grams = grams_of(white.scaled(own), white.scaled(y))._replace(values=count)
+            groups = groups_of(shown[k] for k in chosen)
             fit = fit_sets(grams, [groups], 0.0, _UPDATES, _ANY_SIZE, (log_scale, y.new_ones(1)))
             left, log_scale = y - own @ fit.mean[0], fit.log_scale
             free = 1 - float(fit.effective[0]) / max(float(white.counted.sum()) * len(channels), 1.0)
@@ -162,7 +163,7 @@ class _Everything:
         )
         square = axes.square * (share / before).mean()
         squares, there = white.scaled(left).square().sum(), torch.ones(len(square), dtype=torch.bool)
-        return fit_in_axes(square, along, there, squares, Prior(float(left.numel()), 0.0, _ANY_SIZE)).log_evidence
+        return fit_in_axes(square, along, there, squares, Prior(float(self._weight.sum()), 0.0, _ANY_SIZE)).log_evidence
 
 
 def _spread(factors: Tensor) -> float:
@@ -184,7 +185,7 @@ def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
     target = white.scaled(y).mT
     groups = [NO_COLUMNS] * len(target) + [own for each in every.by_channel(y, white) for own in each]
     squares = target.square().sum(-1).repeat(1 + len(every.columns))
-    fits, _ = fit_single_groups(groups, squares, Prior(float(target.shape[-1]), 0.0, _ANY_SIZE))
+    fits, _ = fit_single_groups(groups, squares, Prior(float(white.counted.sum()), 0.0, _ANY_SIZE))
     evidence, noise = fits.log_evidence.reshape(-1, len(target)), fits.noise.reshape(-1, len(target))
     best = evidence.max(0)
     left = noise.gather(0, best.indices[None])[0] / noise[0]
