@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.prepare import prepare
+from ccnn_torch.calibration.prepare import over_all_rows, prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
 from ccnn_torch.compensation.model_files.metadata import open_onnx
@@ -123,6 +123,26 @@ def test_held_out_rows_do_not_change_the_coefficients(played: Path, tmp_path: Pa
     assert other.physics is not None
     assert torch.equal(first.dataset.splits[0].test, other.dataset.splits[0].test)
     assert first.physics.block() == other.physics.block()
+
+
+def test_effects_of_the_saved_model_are_searched_in_all_rows(played: Path) -> None:
+    prepared = prepare(RunConfig.from_keys(**keys(played, geometry="none", effects=["compliance", "joint_gain"])))
+    source = prepared.source
+    assert source is not None and source.search is not None and source.verdict is not None
+    assert {name for name, _ in source.verdict.effects} == {"compliance", "joint_gain"}
+    every = torch.arange(len(source.records))
+    again = over_all_rows(prepared)
+    assert again.physics is not None and bool(again.physics.rows.all())
+    searched = source.search(every)[0]
+    assert searched is not None and again.source is not None and again.source.verdict is not None
+    assert again.source.verdict.effects == searched.effects
+    # Where all rows show nothing the effects of the training rows stay.
+    alone = replace(prepared, source=source._replace(search=lambda rows: (None, [])))
+    kept = over_all_rows(alone).source
+    assert kept is not None and kept.verdict is source.verdict
+    # A file's effects are what was asked for.
+    given = prepare(RunConfig.from_keys(**keys(played))).source
+    assert given is not None and given.search is None
 
 
 def test_the_network_learns_what_is_left_exactly(played: Path) -> None:
