@@ -32,7 +32,9 @@ class SimulateConfig(JobConfig):
     load: Annotated[float, Field(ge=0)] = Field(default=60.0, description="standard deviation of forces, in N")
     moment: Annotated[float, Field(ge=0)] = Field(default=6.0, description="standard deviation of moments, in N*m")
     gravity: tuple[float, float, float] | None = Field(
-        default=None, description="in the base frame, in m/s^2; null = along -y for a machine in the x-y plane, else -z"
+        default=None,
+        description="in the base frame, in m/s^2; null = along -y for a machine in the x-y plane, of an arm on a track "
+        "against its first axis that turns, else -z",
     )
     max_condition: float = Field(
         default=50.0, gt=1, description="largest condition number of the Jacobian: farther is too near to a singularity"
