@@ -430,9 +430,9 @@ def test_the_whole_deviation_has_a_bound_of_its_own() -> None:
     frame, (at, still) = wanted(known("arm"), joints), (found.command, joints)
     left, before = (apart(reached(known("arm"), made, v, joints[:, :0]), frame)[bounded] for v in (at, still))
     assert bool((left < before).all())
-    # Half as much again as the largest one that is needed where rows were measured and around, more than these show.
+    # Three times the largest one that is needed where rows were measured and around, more than these show.
     bound = compensated("arm").most / needed.deviation[needed.status <= 1].abs().amax(0)
-    assert bool((bound > 1.2).all()) and bool((bound < 3).all()), bound
+    assert bool((bound > 2.4).all()) and bool((bound < 6).all()), bound
 
 
 def test_which_machine_is_inverted_and_which_is_none() -> None:
