@@ -342,6 +342,43 @@ def test_keys_that_do_not_go_together(played: Path, tmp_path: Path) -> None:
     assert made.compensator().machine is None
 
 
+def test_lengths_grow_on_beyond_the_temperatures_that_were_measured(cli: Cli, tmp_path: Path) -> None:
+    """Half their range farther on both sides, and where `compensation.ends` says so up to there."""
+    words = (
+        "--effect",
+        "thermal",
+        "--rows",
+        "120",
+        "--noise",
+        "2e-6",
+        "--seed",
+        "3",
+        "--out",
+        str(tmp_path / "rows.csv"),
+    )
+    assert cli("simulate", "--mechanism", "tripod", *words, "--quiet")[0] == 0
+    about = {
+        "records": str(tmp_path / "rows.csv"),
+        "mechanism": "tripod",
+        "methods": ["constant"],
+        "effects": ["thermal"],
+    }
+    warmth = read_table(tmp_path / "rows.csv").column("temperature", "K")
+    for told, ends in (
+        (None, (warmth.min() - np.ptp(warmth) / 2, warmth.max() + np.ptp(warmth) / 2)),
+        (270.0, (270, 320)),
+    ):
+        more = {} if told is None else {"compensation": {"ends": {"temperature": ["270 K", "320 K"]}}}
+        made = calibrate(**about, **more).compensator()
+        assert [c.name for c in made.covariates] == ["temperature"]
+        found = torch.cat(made.ends).tolist()
+        assert found == pytest.approx(ends, abs=1e-6)
+        joints = made.domain.centre[None, :3].expand(3, -1)
+        at = torch.tensor([[ends[0] - 9], [ends[0]], [ends[0] + 1]], dtype=torch.float64)
+        colder, end, inner = made.solve(joints, at).deviation
+        assert torch.equal(colder, end) and not torch.equal(end, inner)
+
+
 def test_paths_start_where_the_key_stands(played: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     path = played / "config.yaml"

@@ -78,7 +78,8 @@ class CompensationConfig(_Part):
     ends: dict[str, Annotated[list[Size], Field(min_length=2, max_length=2)]] = Field(
         default={},
         description="lowest and highest value of a covariate up to which its effects act where it goes beyond what was "
-        "measured, e.g. {load_z: [-150 N, 0 N]}; what was measured where nothing is said",
+        "measured, e.g. {load_z: [-150 N, 0 N]}; what was measured where nothing is said, of a temperature half of its "
+        "range more on both sides",
     )
 
 

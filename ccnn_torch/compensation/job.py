@@ -239,7 +239,7 @@ def sentences(output: Path, found: Compensated, model: LoadedModel) -> list[str]
         if held:
             then += f", with {', '.join(held)} held at the ends of what was measured"
         if told:
-            then += f"{' and' if held else ', with'} {', '.join(told)} at the ends told in compensation.ends"
+            then += f"{' and' if held else ', with'} {', '.join(told)} at wider ones (machine.ends of the card)"
         said.append(f"{found.outside} of them {_is(found.outside)} outside {what} (inside_domain = 0): {then}.")
     if found.damped:
         said.append(
