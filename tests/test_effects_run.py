@@ -348,7 +348,7 @@ def test_lengths_grow_on_beyond_the_temperatures_that_were_measured(cli: Cli, tm
         "--effect",
         "thermal",
         "--rows",
-        "120",
+        "60",
         "--noise",
         "2e-6",
         "--seed",
@@ -376,7 +376,7 @@ def test_lengths_grow_on_beyond_the_temperatures_that_were_measured(cli: Cli, tm
         joints = made.domain.centre[None, :3].expand(3, -1)
         at = torch.tensor([[ends[0] - 9], [ends[0]], [ends[0] + 1]], dtype=torch.float64)
         colder, end, inner = made.solve(joints, at).deviation
-        assert torch.equal(colder, end) and not torch.equal(end, inner)
+        assert torch.allclose(colder, end, rtol=0, atol=1e-12) and not torch.allclose(end, inner, rtol=0, atol=1e-9)
 
 
 def test_paths_start_where_the_key_stands(played: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
