@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,7 +17,6 @@ from ccnn_torch.calibration.fitting import Comparison, Fitted, compare, fit_meth
 from ccnn_torch.calibration.prepare import Prepared, damping_of, ends_of, over_all_rows, prepare
 from ccnn_torch.calibration.result import best_method, chosen_by, plan_of, run_results
 from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
-from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError, Seen
@@ -253,8 +252,7 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
     names = [c.name for c in covariates]
     physics = {} if prepared.physics is None else prepared.physics.modules(repeat, there, margin, names)
     if "machine" in physics:
-        grown = _of_other_days(covariates, inputs[:, len(prepared.mechanism.joints) :])
-        physics["machine"].ends = grown | ends_of(config, prepared.covariate_coordinates)
+        physics["machine"].ends = ends_of(config, prepared.covariate_coordinates)
     elif config.compensation.ends and physics.get("effects") is not None:
         raise MethodFailedError("compensation.ends: effects of this machine are fitted to what was measured; remove it")
     if physics and "machine" not in physics and limit is None:
@@ -285,19 +283,6 @@ def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], L
         make_learner(method, settings)
         found[method.rpartition(":")[2]] = partial(make_learner, method, settings)
     return found
-
-
-# Of the range of a temperature that was measured: how far beyond it effects go on, lengths growing as they did.
-_WARMER = 0.5
-
-
-def _of_other_days(covariates: Sequence[Coordinate], values: Tensor) -> dict[str, tuple[float, float]]:
-    """Ends up to which effects follow each temperature, by its name [K]: another day is seldom as warm as that of the
-    rows; values: `s x m` [SI]."""
-    low, high = values.amin(0), values.amax(0)
-    more = _WARMER * (high - low)
-    ends = zip(covariates, (low - more).tolist(), (high + more).tolist(), strict=True)
-    return {c.name: (lowest, highest) for c, lowest, highest in ends if c.unit == "K"}
 
 
 def _limit(config: RunConfig, joints: int) -> Tensor | None:

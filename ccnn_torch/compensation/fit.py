@@ -178,6 +178,8 @@ def fit_compensator(
     frozen, geometry, effects, machine = copy.deepcopy((network, geometry, effects, machine))
     frozen.requires_grad_(False)
     inputs, whole = inputs.detach(), _with_known(inputs, deviations, geometry, effects)
+    if machine is not None:
+        machine.ends = _of_other_days(covariates, inputs[:, n:]) | machine.ends
     limit = default_limit(whole) if limit is None else limit.detach()
     if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
         raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
@@ -256,6 +258,19 @@ def _count_steps(compensator: Compensator, inputs: Tensor) -> None:
         if best[0] <= _GENTLE_STEPS:
             break
     compensator.iterations, compensator.secant = best
+
+
+# Of the range of a temperature that was measured: how far beyond it effects go on, lengths growing as they did.
+_WARMER = 0.5
+
+
+def _of_other_days(covariates: Sequence[Coordinate], values: Tensor) -> dict[str, tuple[float, float]]:
+    """Ends up to which effects follow each temperature, by its name [K]: another day is seldom as warm as that of the
+    rows; values: `s x m` [SI]."""
+    low, high = values.amin(0), values.amax(0)
+    more = _WARMER * (high - low)
+    ends = zip(covariates, (low - more).tolist(), (high + more).tolist(), strict=True)
+    return {c.name: (lowest, highest) for c, lowest, highest in ends if c.unit == "K"}
 
 
 @torch.no_grad()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,32 +17,18 @@ from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 
 class _Form(NamedTuple):
-    """How large a motion is along the way of a joint: of -1 to 1 over its travel, or of its angle [rad].
+    """A form in which a motion goes along the way of a joint.
 
     Attributes:
         name: as coefficients name it.
-        of: the motion, 1 at its largest.
         size: how large it is likely to be beside the others.
         secondary, part: as of `Coefficient`.
     """
 
     name: str
-    of: Callable[[Tensor], Tensor]
     size: float
     secondary: bool
     part: str
-
-
-def _legendre(degree: int) -> Callable[[Tensor], Tensor]:
-    """Legendre's polynomial by Bonnet's recursion."""
-
-    def of(u: Tensor) -> Tensor:
-        before, here = torch.ones_like(u), u
-        for k in range(2, degree + 1):
-            before, here = here, ((2 * k - 1) * u * here - (k - 1) * before) / k
-        return here
-
-    return of
 
 
 # Highest degree over a travel: of rails of 4 m screwed down every 0.6 m with some to spare. Halves and quarters of it
@@ -53,20 +39,25 @@ _DEGREES = 16
 def _slide(degree: int) -> _Form:
     """As large as of a path whose slope is random: the mean square falls with the square of the degree."""
     part = "waves" if 4 < degree <= _DEGREES // 2 else "short waves" if degree > 4 else ""
-    return _Form(str(degree), _legendre(degree), math.sqrt(2 * degree + 1) / degree, degree > 2, part)
+    return _Form(str(degree), math.sqrt(2 * degree + 1) / degree, degree > 2, part)
 
 
 _SLIDES = tuple(_slide(degree) for degree in range(1, _DEGREES + 1))
 # Bearings and rails are not made alike.
-_TURNS = tuple(
-    _Form(name, of, 1.0, secondary, "turning")
-    for name, of, secondary in (
-        ("sin", torch.sin, False),
-        ("cos", torch.cos, False),
-        ("sin 2", lambda q: torch.sin(2 * q), True),
-        ("cos 2", lambda q: torch.cos(2 * q), True),
-    )
-)
+_TURNS = tuple(_Form(name, 1.0, "2" in name, "turning") for name in ("sin", "cos", "sin 2", "cos 2"))
+
+
+def _along(slides: bool, at: Tensor) -> list[Tensor]:
+    """The forms at places of a joint: `_SLIDES` of -1 to 1 over its travel, or `_TURNS` of its angle [rad]."""
+    if not slides:
+        return [torch.sin(at), torch.cos(at), torch.sin(2 * at), torch.cos(2 * at)]
+    # Bonnet's recursion.
+    found = [torch.ones_like(at), at]
+    for k in range(2, _DEGREES + 1):
+        found.append(((2 * k - 1) * at * found[-1] - (k - 1) * found[-2]) / k)
+    return found[1:]
+
+
 # Of machine tools as built over a metre [m], [rad] (ISO 10791-1); the rows say what it is here.
 _SIZE = {"m": 1e-5, "rad": 2e-5}
 
@@ -126,8 +117,8 @@ class ErrorMotion(Effect):
         base, frames = rotation_vector_to_matrix(values[..., 3:6]), arm.link_frames(situation.joints, values)
         ends = arm.limits.expand(*shape.shape[:-1], -1, -1)
         if not arm.has_limits:
-            slides = torch.nonzero(~arm.revolute)[:, 0]
-            ends = ends.index_copy(-2, slides, shape.reshape(*shape.shape[:-1], len(slides), 2))
+            sliding = torch.nonzero(~arm.revolute)[:, 0]
+            ends = ends.index_copy(-2, sliding, shape.reshape(*shape.shape[:-1], len(sliding), 2))
         low, high = ends.unsqueeze(-3).unbind(-1)
         travel = ((2 * situation.joints - low - high) / (high - low).clamp_min(1e-9)).clamp(-1, 1)
         found = []
@@ -135,8 +126,10 @@ class ErrorMotion(Effect):
             turn, place = frames[i + 1]
             origin = (base @ place[..., None])[..., 0] + values[..., :3]
             twist = twist_columns(situation, situation.platform[0] - origin, base @ turn)
-            at = situation.joints[..., i].expand_as(travel[..., i]) if joint.unit == "rad" else travel[..., i]
-            found += [twist[..., motions] * form.of(at)[..., None, None] for form, motions in _motions(arm, i)]
+            slides = joint.unit == "m"
+            at = travel[..., i] if slides else situation.joints[..., i].expand_as(travel[..., i])
+            own = zip(_motions(arm, i), _along(slides, at), strict=True)
+            found += [twist[..., motions] * size[..., None, None] for (_, motions), size in own]
         return torch.cat(found, -1)
 
 

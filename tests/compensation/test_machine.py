@@ -281,12 +281,16 @@ def test_outside_of_what_was_measured_physics_stays_and_what_was_learned_fades(n
     assert torch.equal(learned, made.safe.expand_as(learned))
 
 
-def test_covariates_are_held_at_the_ends_of_what_was_measured() -> None:
+def test_covariates_are_held_at_ends_by_what_was_measured() -> None:
     name = "sliding arm with effects"
     machine, made = known(name), compensated(name)
     joints, covariates = points(made, 0.5)
     rows = machine.inputs[:, machine.joints.shape[1] :]
     low, high = rows.amin(0), rows.amax(0)
+    # Loads there, a temperature half its range farther.
+    farther = (high - low) / 2 * torch.tensor([1.0, 0.0, 0.0])
+    low, high = low - farther, high + farther
+    assert torch.allclose(torch.stack(made.ends), torch.stack([low, high]), rtol=0, atol=1e-9)
     # Far warmer than measured, with a load of a ton.
     beyond = high + torch.tensor([500.0, 5e3, 1e4], dtype=torch.float64)
     found, at_end = (solved(made, joints, v.expand_as(covariates)) for v in (beyond, high))
