@@ -13,6 +13,7 @@ from diagnosis._machines import NOISE, acting, measured, reached_with, rows_of
 from torch import Tensor
 
 from ccnn_torch.diagnosis import diagnose_rows, engine
+from ccnn_torch.diagnosis.checks import cautions
 from ccnn_torch.diagnosis.checks.identifiable import check_rows
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge_rows
@@ -124,7 +125,7 @@ def test_rows_as_they_should_be_cause_no_doubt() -> None:
     assert diagnose_rows(situation, pose, noise, FEW).cautions == [] and check_rows(situation, pose).cautions == []
 
 
-def test_a_cause_a_thousand_times_too_large_is_doubted() -> None:
+def test_a_cause_a_thousand_times_too_large_is_doubted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loads in kilonewtons under N: the compliance is right, and its size cannot be."""
     situation = rows_of("five_bar", 120, 5)
     pose = reached_with(situation, [acting(situation, "compliance", q1=2e-6, q2=1e-6)], 6)
@@ -132,6 +133,11 @@ def test_a_cause_a_thousand_times_too_large_is_doubted() -> None:
     found = diagnose_rows(replace(situation, covariates=columns), pose, effects=FEW)
     assert found.verdict["effects"] == ["compliance"] and found.verdict["probability"] <= 0.6
     assert any("times as large as is plausible" in caution for caution in found.cautions)
+    # Not from rows that hardly determine it.
+    certain = cautions.covariance
+    monkeypatch.setattr(cautions, "covariance", lambda *of: 1e8 * certain(*of))
+    found = diagnose_rows(replace(situation, covariates=columns), pose, effects=FEW)
+    assert not any("times as large as is plausible" in caution for caution in found.cautions)
 
 
 def test_a_temperature_of_no_workshop_is_doubted() -> None:

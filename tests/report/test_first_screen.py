@@ -138,6 +138,13 @@ def test_what_it_removes_has_the_figure_by_block_beside_the_one_at_random() -> N
         "420 µm → 113 µm on rows at random, 410 µm → 131 µm where nothing was measured (by block); the noise is 21.0 µm"
     )
     assert told["How sure"] == "Probability 0.98 that these causes, and no others, act."
+    results = one_effect()[0]
+    next(e for e in results["effects"] if e["name"] == "thermal")["probability"] = 0.71
+    assert _told(results)["How sure"] == (
+        "Probability 0.98 that these causes act; likely beside them: thermal growth (0.71)."
+    )
+    results["effects"][0]["indistinguishable_from"] = ["thermal"]
+    assert _told(results)["How sure"] == "Probability 0.98 that these causes, and no others, act."
     assert "not known where nothing was measured" in _told(two_effects()[0])["What it removes"]
 
 

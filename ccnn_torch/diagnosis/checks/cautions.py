@@ -23,7 +23,7 @@ from ccnn_torch.diagnosis.verdict.judgement import Judgement, implausible_size
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.diagnosis.verdict.remainder import times_as_scatter, times_the_noise
 from ccnn_torch.display import number_text
-from ccnn_torch.effects import EXACT, Situation
+from ccnn_torch.effects import EXACT, Coefficient, Situation
 from ccnn_torch.effects.time import ROW
 from ccnn_torch.evidence.dictionary import covariance
 from ccnn_torch.evidence.judge import BESIDE_UNKNOWN
@@ -45,8 +45,8 @@ _STILL = 1e-3
 _OF_PLACE = EXACT | {"coupling", "error_motion", "gravity", "transmission"}
 # Periods from which an error is seen to repeat.
 _PERIODS = 1.5
-# Standard deviations from which a coefficient has a sign.
-_SIGNED = 3.0
+# Standard deviations from which a coefficient surely has its sign, and by which it surely is as large.
+_SURELY = 3.0
 # A workshop, with something to spare [K].
 _COLDEST, _HOTTEST = 213.15, 423.15
 # Variances of a joint that are tried, in units of what would be as much as the noise of the usual row.
@@ -203,17 +203,14 @@ def _of_nothing_gained(analysis: Analysis, judgement: Judgement, together: Gap) 
 def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Causes of the verdict that would have to be hundreds of times as large as in any machine."""
     said, most = [], implausible_size(analysis)
-    for i, mean in zip(judgement.acting.members, judgement.acting.mean, strict=True):
-        atom = analysis.atoms[i]
-        coefficients = atom.coefficients(analysis.situation)
-        if atom.name not in judgement.names or not coefficients:
-            continue
-        size = torch.where(torch.tensor([c.secondary for c in coefficients]), 0.0, mean.abs())
-        worst = int(size.argmax())
-        if float(size[worst]) > most:
+    for name, coefficients, mean, sd in _numbers(analysis, judgement):
+        # A number that the rows hardly determine says nothing of the cause.
+        sure = torch.where(torch.tensor([c.secondary for c in coefficients]), 0.0, mean.abs() - _SURELY * sd)
+        worst = int(sure.argmax())
+        if float(sure[worst]) > most:
             said.append(
                 Caution(
-                    f"{atom.name} would have to be {float(size[worst]):.0f} times as large as is plausible "
+                    f"{name} would have to be {float(mean[worst].abs()):.0f} times as large as is plausible "
                     f"({coefficients[worst].name}): check the units; or another cause looks like it, such "
                     "as a load that acts elsewhere",
                     BESIDE_UNKNOWN,
@@ -224,22 +221,27 @@ def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
 
 def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Causes of the verdict whose coefficients are clearly negative where physics has none such, and none positive."""
-    said, first = [], 0
-    found = judgement.acting
-    for i, mean in zip(found.members, found.mean, strict=True):
-        atom, part = analysis.atoms[i], slice(first, first + len(mean))
-        first += len(mean)
-        coefficients = atom.coefficients(analysis.situation)
-        if atom.name not in judgement.names or not coefficients:
-            continue
-        sure = covariance(analysis.dictionary, found).diagonal()[part].clamp_min(1e-300).sqrt() * _SIGNED
+    said = []
+    for name, coefficients, mean, sd in _numbers(analysis, judgement):
         signed = torch.tensor([c.positive for c in coefficients])
-        negative = torch.nonzero(signed & (mean < -sure))[:, 0].tolist()
-        if negative and not bool((signed & (mean > sure)).any()):
+        negative = torch.nonzero(signed & (mean < -_SURELY * sd))[:, 0].tolist()
+        if negative and not bool((signed & (mean > _SURELY * sd)).any()):
             where = ", ".join(coefficients[k].name for k in negative)
-            wrong = f"{atom.name} would have to be negative ({where}), as in no machine"
+            wrong = f"{name} would have to be negative ({where}), as in no machine"
             said.append(Caution(f"{wrong}: check the signs of the columns that it uses", BESIDE_UNKNOWN))
     return said
+
+
+def _numbers(analysis: Analysis, judgement: Judgement) -> Iterator[tuple[str, tuple[Coefficient, ...], Tensor, Tensor]]:
+    """Of each cause of the verdict its name, coefficients, and these with their standard deviations, `m` each, in
+    plausible sizes."""
+    found = judgement.acting
+    sd = covariance(analysis.dictionary, found).diagonal().clamp_min(1e-300).sqrt()
+    each = zip(found.members, found.mean, sd.split([len(mean) for mean in found.mean]), strict=True)
+    for i, mean, own in each:
+        atom = analysis.atoms[i]
+        if atom.name in judgement.names and (coefficients := atom.coefficients(analysis.situation)):
+            yield atom.name, coefficients, mean, own
 
 
 def _of_scatter(analysis: Analysis, judgement: Judgement) -> list[Caution]:

@@ -23,6 +23,7 @@ from ccnn_torch.diagnosis.verdict.text import (
     in_doubt,
     listed,
     no_effect_words,
+    others_words,
     probability_words,
     size_text,
     undetermined,
@@ -127,7 +128,7 @@ def _wrong(results: Block) -> str:
 def _sure(results: Block) -> str:
     verdict = results["verdict"]
     least = f" {LEAST}" * (len(results.get("joints", ())) > 1)
-    what = "that nothing acts" if verdict["none"] else "that these causes, and no others, act"
+    what = "that nothing acts" if verdict["none"] else others_words(results)
     what = what if verdict["effects"] or verdict["none"] else "that no effect of the library is the cause"
     text = f"Probability {probability_words(verdict['probability'])}{least} {what}"
     if in_doubt(results):

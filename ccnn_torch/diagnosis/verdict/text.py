@@ -21,6 +21,8 @@ SURE = 0.95
 
 LEAST = "at the least sure joint"
 """Of several joints the least probable verdict is that of the whole."""
+# From this probability on an effect is likely, whatever the verdict names.
+_LIKELY = 0.5
 # Below this probability the rows determine no verdict: it is but the likeliest of many.
 _OPEN = 0.05
 # What is left beyond so many steps of an encoder is not its noise.
@@ -131,6 +133,16 @@ def in_doubt(results: Block) -> bool:
     gap, step = results["gap"], results.get("encoder_step")
     left = gap["before"] if gap["after"] is None else gap["after"]
     return results.get("noise") == "estimated" and not (step and left is not None and left <= _STEPS * step)
+
+
+def others_words(results: Block) -> str:
+    """Whether anything acts beside what the verdict names: effects that are likelier than not, with probabilities."""
+    named, every = results["verdict"]["effects"], {e["name"]: e for e in results["effects"]}
+    told = {*named, *(other for name in named if name in every for other in every[name]["indistinguishable_from"])}
+    likely = [e for name, e in every.items() if name not in told and e["probability"] >= _LIKELY]
+    likely.sort(key=lambda e: -e["probability"])
+    each = listed([f"{words_of(e['name']).short} ({probability_words(e['probability'])})" for e in likely])
+    return f"that these causes act; likely beside them: {each}" if likely else "that these causes, and no others, act"
 
 
 def undetermined(results: Block) -> str:
