@@ -35,3 +35,11 @@ def test_the_noise_of_every_channel_is_what_the_causes_leave_among_many_that_cou
     assert set(bad) <= aside and len(aside) < ROWS * 0.05
     told = fitted_whitening(residual, columns, torch.arange(3), NOISE, usable)
     assert told.sigma.tolist() == NOISE.tolist() and set(bad) <= set(torch.nonzero(~told.counted)[:, 0].tolist())
+
+
+def test_a_column_of_zeros_is_no_measurement_without_noise() -> None:
+    columns, usable = [drawn(k, ROWS, 3, 4) for k in range(5)], torch.ones(ROWS, dtype=torch.bool)
+    residual = 1e-4 * columns[2] @ drawn(100, 4) + NOISE * drawn(50, ROWS, 3)
+    residual[:, 0] = 0
+    sigma = fitted_whitening(residual, columns, torch.arange(3), None, usable).sigma
+    assert float(sigma[0] / sigma.max()) == pytest.approx(1e-2)

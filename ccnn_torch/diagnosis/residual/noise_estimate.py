@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,7 +10,6 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.residual.whitening import (
     MAD,
-    NO_NOISE,
     Whitening,
     renewed,
 )
@@ -77,10 +75,10 @@ def fitted_whitening(
     shown = shown if seen is None else [c * seen[..., None] for c in shown]
     count = white.count(torch.nonzero(usable)[:, 0])
     if noise is None:
-        white = replace(white, sigma=(white.usual(y, usable) * MAD).clamp_min(NO_NOISE))
+        white = white.believed(white.usual(y, usable) * MAD)
     candidates = _Everything(shown, white)
     if noise is None:
-        white = replace(white, sigma=white.sigma * _noise_share(candidates, y, white).sqrt())
+        white = white.believed(white.sigma * _noise_share(candidates, y, white).sqrt())
     chosen: list[int] = []
     log_scale = y.new_zeros(1, 0)
     left, free = y, 1.0

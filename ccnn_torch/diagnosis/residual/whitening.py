@@ -79,8 +79,9 @@ MAD = 1.4826
 """Standard deviation of a normal variate over its median absolute deviation."""
 LEAST_FREE = 0.1
 """Share of the values that a fit leaves free, at least: no noise is estimated from fewer."""
-# Estimated noise, at least, as a share of the residual.
-_LEAST_NOISE = 1e-4
+# Estimated noise, at least, as a share of the residual, and of the noise of the other channels of its unit: a column of
+# zeros, as for the height of a machine that moves in a plane, is no measurement without noise.
+_LEAST_NOISE, _AMONG_CHANNELS = 1e-4, 1e-2
 ROUNDING = 1e-9
 """Directions of what was fitted before with less than this share of the largest one are rounding."""
 
@@ -163,6 +164,12 @@ class Whitening:
         """How many values were measured in some rows, by default in those that count."""
         there = self.keep() if rows is None else rows
         return float(len(there) * len(self.channels) if self.seen is None else self.seen[there].sum())
+
+    def believed(self, sigma: Tensor) -> Whitening:
+        """The same with another noise, `c` [m, rad], of each channel at least what is believed."""
+        alike = self.lengths[:, None] == self.lengths
+        among = _AMONG_CHANNELS * torch.where(alike, sigma, 0.0).amax(-1)
+        return replace(self, sigma=torch.maximum(sigma, among).clamp_min(NO_NOISE))
 
     @property
     def counted(self) -> Tensor:
@@ -276,5 +283,5 @@ def renewed(white: Whitening, left: Tensor, residual: Tensor, free: float, usabl
         counted = white.counted & usable
         spread = white.usual(left, counted) * MAD / max(free, LEAST_FREE) ** 0.5
         rms = white.usual(residual, counted) * MAD
-        white = replace(white, sigma=torch.maximum(spread, _LEAST_NOISE * rms).clamp_min(NO_NOISE))
+        white = white.believed(torch.maximum(spread, _LEAST_NOISE * rms))
     return reweighted(white, left, usable, free)
