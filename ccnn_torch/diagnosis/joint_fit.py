@@ -25,7 +25,7 @@ from ccnn_torch.diagnosis.residual.rows import fitted_frames, in_groups
 from ccnn_torch.diagnosis.residual.whitening import Whitening, device_axes, moving_channels, renewed
 from ccnn_torch.effects import Acting, Effect, Situation, measured_channels, moved
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
-from ccnn_torch.evidence.priors import EFFECT
+from ccnn_torch.evidence.priors import EFFECT, WIDE
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.outliers import inlying
@@ -91,14 +91,12 @@ def _most_probable(rows: _Rows, at: Tensor, white: Whitening, fit: Fits, measure
     A step that leads away from the rows, or to where one of them cannot be, is shortened (Levenberg-Marquardt): what
     the rows hardly show may turn so far that the linear model is no model of it.
     """
-    model, groups, begin = rows.model, rows.groups, at
-    free = torch.cat([rows.frames, *groups])
+    model, begin = rows.model, at
+    free, likely = rows.likely(fit)
     if not len(free):
         return at, rows
-    scales_of = [s.expand(len(g)) for g, s in zip(groups, fit.log_scale[0], strict=False)]
     # What the prior asks of a coefficient, in units of the noise.
-    wide = at.new_full((len(rows.frames),), _ANYWHERE**2)
-    drawn = (fit.noise[0] / torch.cat([wide, *(s.exp() for s in scales_of)])).sqrt()
+    drawn = 1 / likely
     seen = [(at[free], rows)]
 
     def both(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -291,6 +289,13 @@ class _Rows:
         """The columns of the frames that do anything."""
         return self._acting().get((_FRAMES, ""), torch.arange(0))
 
+    def likely(self, fit: Fits) -> tuple[Tensor, Tensor]:
+        """The columns that do anything, and how large a fit to `groups` takes their coefficients to be: standard
+        deviations in plausible sizes, over that of the noise."""
+        own = [s.expand(len(g)).exp() for g, s in zip(self.groups, fit.log_scale[0], strict=False)]
+        wide = fit.noise.new_full((len(self.frames),), _ANYWHERE**2)
+        return torch.cat([self.frames, *self.groups]), (torch.cat([wide, *own]) / fit.noise[0]).sqrt()
+
     def _acting(self) -> dict[tuple[str, str], Tensor]:
         acts = self.columns.abs().amax((0, 1)) > 0
         found: dict[tuple[str, str], list[int]] = {}
@@ -362,15 +367,19 @@ def _first(effect: Effect, situation: Situation) -> Known:
 
 def _at_better_shape(rows: _Rows, i: int, scan: Scan) -> _Rows:
     """With one of the effects at the shapes that explain most beside the others, where that pays for their search."""
-    model, known, white = rows.model, rows.model.known[i], scan.white
-    others = rows.columns.clone()
-    others[..., _span(model, i)] = 0.0
-    others = others[..., others.abs().amax((0, 1)) > 0]
-    found = scan.best(SearchRows(white(rows.target), white(others)))
+    known, white = rows.model.known[i], scan.white
+    without = rows.with_shape(i, replace(known, used=()))
+    # The others are as large as they are likely to be: what is free explains a wave as well.
+    which, likely = without.likely(_fitted(without, white))
+    found = scan.best(SearchRows(white(rows.target), white(without.columns[..., which]) * likely / WIDE))
     used = tuple(range(len(known.coefficients))) if found.used is None else found.used
     tried = rows.with_shape(i, replace(known, shape=found.value, used=used))
-    evidence = [float(fit_sets(r.grams(white), [r.groups], 0.0).log_evidence) for r in (rows, tried)]
+    evidence = [float(_fitted(r, white).log_evidence) for r in (rows, tried)]
     return tried if evidence[1] - found.charge > evidence[0] else rows
+
+
+def _fitted(rows: _Rows, white: Whitening) -> Fits:
+    return fit_sets(rows.grams(white), [rows.groups], 0.0)
 
 
 def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
