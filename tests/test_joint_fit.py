@@ -94,10 +94,10 @@ def test_what_acts_stays_and_the_machine_is_found_to_the_noise(made: Made, there
 
 def test_drives_err_with_several_periods() -> None:
     situation = rows(250, 1)
-    acting = [waves(1.0, 1.5e-4, situation), waves(11.0, 1e-4, situation)]
+    acting = [waves(1.0, 1.5e-4, situation), waves(11.0, 1e-4, situation), waves(47.0, 5e-5, situation)]
     names, found = fitted(situation, measured(situation, acting, NOISE))
-    assert names.count("transmission") > 1
-    assert {1.0, 11.0} <= {float(order) for one in found.acting for order in one.shape}
+    assert names.count("transmission") == 3
+    assert {1.0, 11.0, 47.0} <= {float(order) for one in found.acting for order in one.shape}
     assert miss(found, acting) < 1.5 * NOISE
 
 

@@ -39,7 +39,8 @@ _STEPS, _DAMPING, _LAST = 12, 1e-8, 0.1
 # Standard deviation of a frame's coordinate where the rows leave it open, in plausible errors, and the share of the
 # largest below which they leave a direction open.
 _ANYWHERE, _OPEN = 1e2, 1e-9
-# Times an effect that may have any period acts, at most: a gear train errs with more than one.
+# Periods that are looked for of an effect that may have any, beside once a turn, which needs no search: a gear train
+# errs with more than one.
 _TIMES = 2
 _PARAMETERS, _FRAMES = "parameters", "frames"
 
@@ -124,7 +125,8 @@ def effects_that_pay(
     """The effects without which the rows would be less probable, beside all others, with their shapes.
 
     All are there at first, at the shapes of the textbook or, where that is more probable, at those that the rows show.
-    One that may have any period may be there several times. Then the one that adds least to the marginal likelihood is
+    One that may have any period is there with that of the textbook, and with as many more as the rows show up to
+    `_TIMES`; each stands or falls by itself. Then the one that adds least to the marginal likelihood is
     left out, or what is secondary in it, as long as it adds less than it costs to have it in the library. What stands
     for another one is left out so, too.
 
@@ -133,18 +135,19 @@ def effects_that_pay(
         effects: candidates, all of which the rows have the covariates for.
     """
     start = fit_jointly(situation, measured, [], usable, loose).parameters
-    known = [_first(effect, situation) for effect in effects]
-    # Those that may act again do nothing as yet.
-    again = [replace(k, used=()) for k in known for _ in range(1, _TIMES) if _has_any_period(k.effect, situation)]
-    model = _Model(situation, [*known, *again], loose)
+    first = [_first(effect, situation) for effect in effects]
+    settled = [k for k in first if not k.shape.numel() or _has_any_period(k.effect, situation)]
+    searched = [k for k in first if not any(k is one for one in settled)]
+    # Those of any period do nothing as yet.
+    searched += [replace(k, used=()) for k in settled if k.shape.numel() for _ in range(_TIMES)]
+    model = _Model(situation, [*settled, *searched], loose)
     rows = model.about(model.begin(start), measured, usable)
     white = rows.whitening()
     scans: dict[str, Scan] = {}
-    for i, one in enumerate(model.known):
-        if one.shape.numel():
-            scan = scans.get(one.effect.name) or Scan(situation, rows.there, one.effect, white)
-            scans[one.effect.name] = scan
-            rows = _at_better_shape(rows, i, scan)
+    for i, one in enumerate(searched, len(settled)):
+        scan = scans.get(one.effect.name) or Scan(situation, rows.there, one.effect, white)
+        scans[one.effect.name] = scan
+        rows = _at_better_shape(rows, i, scan)
     return _without_idle(rows, white)
 
 
@@ -236,10 +239,10 @@ class _Model:
         return torch.where(used, columns, 0.0)
 
     def labels(self) -> list[tuple[str, str]]:
-        """What the coefficients of a group have in common: what they are of, and which part."""
+        """What the coefficients of a group have in common: the effect they are of, by number, and which part."""
         found = [
-            (k.effect.name, c.part or ("secondary" if c.secondary else ""))
-            for k in self.known
+            (str(i), c.part or ("secondary" if c.secondary else ""))
+            for i, k in enumerate(self.known)
             for c in k.effect.coefficients(self.situation)
         ]
         mechanism = self.situation.mechanism
