@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -99,6 +100,19 @@ def test_drives_err_with_several_periods() -> None:
     assert names.count("transmission") == 3
     assert {1.0, 11.0, 47.0} <= {float(order) for one in found.acting for order in one.shape}
     assert miss(found, acting) < 1.5 * NOISE
+
+
+def test_drives_that_the_file_tells_are_looked_for_there_whatever_their_period() -> None:
+    """No whole number a turn, and more of them than are searched."""
+    situation = rows(250, 1)
+    acting = [waves(50.4, 4e-5, situation)]
+    pose = measured(situation, acting, NOISE)
+    machine = SerialArm(**{**situation.mechanism.recipe["keys"], "gears": [50.4] * 6})
+    told = replace(situation, mechanism=machine)
+    names, found = fitted(told, pose)
+    assert names == ["transmission"] and found.acting[0].shape.tolist() == [50.4] * 6
+    assert miss(found, acting) < NOISE
+    assert miss(fitted(situation, pose)[1], acting) > 1.5 * miss(found, acting)
 
 
 def test_parameters_that_are_not_loose_stay() -> None:

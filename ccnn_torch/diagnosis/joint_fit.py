@@ -8,7 +8,7 @@ they have to be: where a plate stands is no error of the machine, and what they 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
-from ccnn_torch.diagnosis.candidates.atom import scales, textbook_shapes
+from ccnn_torch.diagnosis.candidates.atom import scales, textbook_shapes, told_shapes
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
 from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
@@ -125,21 +125,22 @@ def effects_that_pay(
     """The effects without which the rows would be less probable, beside all others, with their shapes.
 
     All are there at first, at the shapes of the textbook or, where that is more probable, at those that the rows show.
-    One that may have any period is there with that of the textbook, and with as many more as the rows show up to
-    `_TIMES`; each stands or falls by itself. Then the one that adds least to the marginal likelihood is
-    left out, or what is secondary in it, as long as it adds less than it costs to have it in the library. What stands
-    for another one is left out so, too.
+    One that may have any period is there with those of the textbook and of the machine's file, and with as many more as
+    the rows show up to `_TIMES`; each stands or falls by itself. Then the one that adds least to the marginal
+    likelihood is left out, or what is secondary in it, as long as it adds less than it costs to have it in the library.
+    What stands for another one is left out so, too.
 
     Args:
         situation, measured, usable, loose: as in `fit_jointly`.
         effects: candidates, all of which the rows have the covariates for.
     """
     start = fit_jointly(situation, measured, [], usable, loose).parameters
-    first = [_first(effect, situation) for effect in effects]
+    first = [_at(textbook_shapes, effect, situation) for effect in effects]
     settled = [k for k in first if not k.shape.numel() or _has_any_period(k.effect, situation)]
     searched = [k for k in first if not any(k is one for one in settled)]
     # Those of any period do nothing as yet.
     searched += [replace(k, used=()) for k in settled if k.shape.numel() for _ in range(_TIMES)]
+    settled += [k for effect in effects if (k := _at(told_shapes, effect, situation)).used]
     model = _Model(situation, [*settled, *searched], loose)
     rows = model.about(model.begin(start), measured, usable)
     white = rows.whitening()
@@ -362,9 +363,11 @@ def _has_any_period(effect: Effect, situation: Situation) -> bool:
     return bool(shapes) and all(s.usual is None for s in shapes)
 
 
-def _first(effect: Effect, situation: Situation) -> Known:
-    """An effect at the shapes of the textbook, without what can have any period."""
-    value, used = textbook_shapes(situation, effect)
+def _at(
+    shapes: Callable[[Situation, Effect], tuple[Tensor, tuple[int, ...]]], effect: Effect, situation: Situation
+) -> Known:
+    """An effect at its shapes of the textbook or of the machine's file, without what has none there."""
+    value, used = shapes(situation, effect)
     return Known(effect, value, value.new_zeros(len(effect.coefficients(situation))), used)
 
 

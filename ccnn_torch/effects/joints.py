@@ -163,6 +163,7 @@ class Transmission(OfJoints):
         travels = torch.maximum(measured, _LEAST_TRAVEL * (high - low)).tolist()
         joints, count = situation.mechanism.joints, len(_HARMONICS)
         alike = any(p.leg is not None for p in situation.mechanism.geometry)
+        gears = situation.mechanism.gears or (None,) * len(joints)
         if alike:
             travels = [max(t for t, other in zip(travels, joints, strict=True) if other.unit == j.unit) for j in joints]
         return tuple(
@@ -173,8 +174,9 @@ class Transmission(OfJoints):
                 tuple(range(count * i, count * (i + 1))),
                 refined=j.unit != "rad",
                 alike=j.unit if alike else "",
+                told=gear if gear is None or j.unit == "rad" else 2 * math.pi / gear,
             )
-            for i, j in enumerate(joints)
+            for i, (j, gear) in enumerate(zip(joints, gears, strict=True))
         )
 
     def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:

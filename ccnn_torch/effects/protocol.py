@@ -60,6 +60,7 @@ class Shape:
         usual: what a simulation takes unless given; drawn from the lower half of the grid where None.
         alike: shapes with one such text, and one grid, are of parts that are made alike, and likely have one value;
             empty = it is like no other.
+        told: the value that the machine's file tells, or None.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Shape:
     usual: float | None = None
     refined: bool = True
     alike: str = ""
+    told: float | None = None
 
     @property
     def textbook(self) -> float | None:

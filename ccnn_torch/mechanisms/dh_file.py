@@ -38,8 +38,9 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     (a text with "unknown", "identity", or [x, y, z, rx, ry, rz]; unknown when missing), `tool_offset` (likewise, but
     [x, y, z]; replaces the tool frame for records without orientation), `goal_tool` (the frame that commanded poses are
     of, where it is not the measured one), `frame_per`, `tool_per`, `robot` (its name), `limits` of the joints
-    (each [lowest, highest] in the file's units; a full turn or a metre), `masses` of the links [kg] and
-    `centres` of these (each [x, y, z] in the frame at the link's end; [] or missing: halfway to the next axis).
+    (each [lowest, highest] in the file's units; a full turn or a metre), `masses` of the links [kg],
+    `centres` of these (each [x, y, z] in the frame at the link's end; [] or missing: halfway to the next axis), and
+    `gears` (of each joint turns of the motor for one of the joint, the lead of a screw in the file's length, or null).
 
     Args:
         path: the file.
@@ -89,6 +90,7 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
         limits=table.limits(types, length, angle),
         masses=table.masses(n),
         centres=table.centres(n, length),
+        gears=table.gears(types, length),
         leans=[[i, v * angle] for i, v in enumerate(table.numbers("beta", n, default=[0.0] * n), 1) if v],
     )
 
@@ -141,6 +143,20 @@ class _Table:
         if any(low >= high for low, high in found):
             raise InputError(f"{where} must have the lowest value of each joint before the highest")
         return found
+
+    def gears(self, types: Sequence[str], length: float) -> list[float | None]:
+        """Turns of each motor for one of its joint [1], or the lead of its screw [m]; none where nothing is told."""
+        value = self.content.get("gears", [])
+        if not isinstance(value, list) or ("gears" in self.content and len(value) != len(types)):
+            raise InputError(f"{self.path}: key 'gears' must list {len(types)} numbers, as [121, null, …]")
+        where = f"{self.path}: key 'gears', entry"
+        told = [None if v is None else _number(v, f"{where} {i}") for i, v in enumerate(value, 1)]
+        if wrong := [i for i, v in enumerate(told, 1) if v is not None and v <= 0]:
+            raise InputError(
+                f"{where} {wrong[0]} must be above 0, or null where nothing is known, got {told[wrong[0] - 1]:g}"
+            )
+        scales = [1.0 if kind == "revolute" else length for kind in types]
+        return [None if v is None else v * s for v, s in zip(told, scales, strict=False)]
 
     def masses(self, count: int) -> list[float]:
         """[kg]; none where the file does not tell them."""

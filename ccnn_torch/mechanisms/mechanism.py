@@ -72,6 +72,8 @@ class Mechanism(nn.Module):
         inverse_kinematics: child module around `solve_inverse`, the place for forward hooks.
         takes: covariates that the nominal machine itself depends on: a simulator's; () for all others.
         frame_per, tool_per: columns of records that number groups of rows with a base or tool frame of their own.
+        gears: of each joint what its drive's file tells: turns of the motor for a turn of the joint [1], or the lead of
+            a screw [m], or None; () where nothing is told.
     """
 
     nominal: Tensor
@@ -83,6 +85,7 @@ class Mechanism(nn.Module):
     takes: tuple[Condition, ...] = ()
     frame_per: tuple[str, ...] = ()
     tool_per: tuple[str, ...] = ()
+    gears: tuple[float | None, ...] = ()
     closed_form: Literal["forward", "inverse"] | None = None
 
     def __init__(

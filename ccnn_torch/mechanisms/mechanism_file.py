@@ -154,7 +154,7 @@ def dh_text(arm: SerialArm) -> str:
         **dict(zip(("a", "alpha", "d", "theta"), links, strict=True)),
         **({"beta": arm.lean_of_links(arm.nominal).tolist()} if arm.leans else {}),
         "parallel_axes": [list(group) for group in arm.parallel_axes],
-        **{key: value for key in ("limits", "masses", "centres") if (value := arm.recipe["keys"].get(key))},
+        **{key: value for key in ("limits", "masses", "centres", "gears") if (value := arm.recipe["keys"].get(key))},
         "base_frame": "unknown" if arm.frame_per else values[:6],
         "tool_frame": "unknown" if arm.tool_per else values[-6:],
         "frame_per": list(arm.frame_per),

@@ -44,6 +44,9 @@ from ccnn_torch.mechanisms.mechanism_file import dh_text
             "dof: 6\nlimits: [[1, 0], [0, 1], [0, 1], [0, 1], [0, 1], [0, 1]]",
             "lowest value of each joint before",
         ),
+        ("dof: 6", "dof: 6\ngears: [100]", "key 'gears' must list 6 numbers"),
+        ("dof: 6", "dof: 6\ngears: [1, 1, 1, 1, 1, x]", "key 'gears', entry 6 must be a finite number"),
+        ("dof: 6", "dof: 6\ngears: [1, -1, 1, 1, 1, 1]", "key 'gears', entry 2 must be above 0, or null"),
         ("dof: 6", "dof: 6\nmasses: [1, 1]", "key 'masses' must list 6 numbers, one per joint, got 2"),
         ("dof: 6", "dof: 6\nmasses: [1, 1, 1, 1, 1, -1]", r"must list 6 masses \[kg\] of at least 0, got"),
         ("dof: 6", "dof: 6\nmasses: [0, 0, 0, 0, 0, 0]", "key 'masses' must list 6 masses"),
@@ -66,17 +69,19 @@ def test_dh_file_mistakes(tmp_path, old, new, said):
     assert "arm.yaml" in str(caught.value)
 
 
-def test_limits_of_a_dh_file_are_the_sampling_box(tmp_path):
+def test_limits_and_gears_of_a_dh_file_are_those_of_the_arm(tmp_path):
     path = tmp_path / "arm.yaml"
     path.write_text(
         "dof: 2\nconvention: standard Denavit-Hartenberg\nunits: {length: mm, angle: deg}\na: [0, 300]\n"
         "alpha: [-90, 0]\nd: [0, 0]\ntheta: [0, 0]\njoint_types: [prismatic, revolute]\n"
-        "limits: [[0, 4000], [-90, 45]]\n"
+        "limits: [[0, 4000], [-90, 45]]\ngears: [20, 121]\n"
     )
     arm = read_dh_file(str(path))
+    assert arm.gears == arm.with_link_frames().gears == pytest.approx((0.02, 121))
     assert arm.limits.flatten().tolist() == pytest.approx([0, 4, -1.5707963267948966, 0.7853981633974483])
     path.write_text(dh_text(arm))
-    assert torch.equal(read_dh_file(str(path)).limits, arm.limits)
+    again = read_dh_file(str(path))
+    assert torch.equal(again.limits, arm.limits) and again.gears == arm.gears
 
 
 def test_dh_file_that_is_none(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ccnn_torch.effects import Situation, default_gravity, make_effect
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism, mechanism_from_description
 from ccnn_torch.mechanisms.kinds.machine_file import KINDS, template
@@ -156,6 +157,19 @@ def test_joints_of_a_hexapod_are_known_as_well_as_the_file_says(tmp_path: Path) 
     assert by_name["P3z"].nominal == pytest.approx(1e-3) and by_name["B2y"].scale == pytest.approx(3e-4)
 
 
+def test_drives_that_a_file_tells_are_the_machines_however_it_is_seen(tmp_path: Path) -> None:
+    path = tmp_path / "gantry.yaml"
+    path.write_text("machine: gantry\ngears: {q1: 20 mm, q3: 5 mm}\nbase_frame: identity\ntool_frame: identity\n")
+    made = load_mechanism(str(path))
+    assert made.gears == made.with_nominal(made.nominal + 1e-4).gears == pytest.approx((0.02, None, 0.005))
+    assert load_mechanism("instrument", mechanism=str(path), kind="level").gears == made.gears
+    situation = Situation(made, made.sample_joints(20, torch.Generator().manual_seed(0)), {}, default_gravity(made))
+    told = [shape.told for shape in make_effect("transmission").shapes(situation)]
+    assert (
+        told[1] is None and told[0] == pytest.approx(2 * np.pi / 0.02) and told[2] == pytest.approx(2 * np.pi / 0.005)
+    )
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [
@@ -170,6 +184,10 @@ def test_joints_of_a_hexapod_are_known_as_well_as_the_file_says(tmp_path: Path) 
         ("machine: gantry\nnumbers: {lead_x: 0 um/m +- 3e2}", "'3e2' has no unit; write 3e2 um/m"),
         ("machine: hexapod\nnumbers: {L: +- 1 mm}", "numbers.L: '' is no number"),
         ("machine: gantry\nlimits: 3", "limits: must be as"),
+        ("machine: gantry\ngears: {q9: 10 mm}", "gears: 'q9' is not known"),
+        ("machine: gantry\ngears: {q1: 10}", "gears.q1: '10' has no unit; write 10 mm"),
+        ("machine: gantry\ngears: {q1: 0 mm}", "gears.q1: must be above 0"),
+        ("machine: gantry\ngears: 100", "gears: must be as {q1: 80"),
         ("machine: gantry\nnumbers: 3", "must have lines such as"),
         ("machine: gantry\ntool_fram: identity", "the key 'tool_fram' is not known; did you mean 'tool_frame'"),
         ("machine: hexapod\nnumbers: {base_radius: 280 mm +- 1 mm}", "takes no tolerance, since it is not fitted"),

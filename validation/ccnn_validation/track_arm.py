@@ -38,7 +38,7 @@ a: [0, 0.26, 0.68, -0.035, 0, 0, 0], alpha: [-90, -90, 0, -90, 90, -90, 0], d: [
 theta: [0, 0, 0, 0, 0, 0, 0], masses: [400, 110, 70, 55, 30, 9, 3],
 centres: [[0, 0, 0], [-0.15, 0.2, 0], [-0.36, 0, 0.06], [0.02, 0, 0.1], [0, -0.32, 0], [0, 0, 0.03], [0, 0, -0.03]],
 base_frame: unknown, tool_offset: unknown, limits: [[0, 4], [-90, 90], [-100, -30], [-60, 50], [-150, 150], [-100, 100],
-[-150, 150]]}
+[-150, 150]], gears: [0.25, null, null, null, null, null, null]}
 """
 # The same machine with the axis z of its base upward, not along the track: a modified table.
 UPRIGHT = """{robot: arm on a track, dof: 7, convention: modified Denavit-Hartenberg, units: {length: m, angle: deg},
@@ -47,7 +47,7 @@ a: [0, 0, 0.26, 0.68, -0.035, 0, 0], alpha: [90, -90, -90, 0, -90, 90, -90], d: 
 theta: [0, 0, 0, 0, 0, 0, 0], masses: [400, 110, 70, 55, 30, 9, 3],
 centres: [[0, 0, 0], [0.11, 0, -0.2], [0.32, 0, 0.06], [-0.015, 0.1, 0], [0, 0, -0.32], [0, 0.03, 0], [0, 0, -0.03]],
 base_frame: unknown, tool_offset: unknown, limits: [[0, 4], [-90, 90], [-100, -30], [-60, 50], [-150, 150], [-100, 100],
-[-150, 150]]}
+[-150, 150]], gears: [0.25, null, null, null, null, null, null]}
 """
 
 

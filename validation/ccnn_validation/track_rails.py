@@ -48,7 +48,8 @@ joint_types: [prismatic, revolute, revolute, revolute, revolute, revolute, revol
 a: [0, 0, 0.35, 0.85, 0.145, 0, 0], alpha: [-90, 90, -90, 0, -90, 90, -90], d: [0, 0.815, 0, 0, 0.82, 0, 0.17],
 theta: [0, 0, 0, -90, 0, 0, 0], base_frame: unknown, tool_offset: unknown, masses: [400, 160, 110, 130, 40, 12, 22],
 centres: [[], [0.15, 0, -0.265], [0.4, 0, 0.08], [0.1, 0.15, 0], [0, 0, -0.35], [0, 0.03, 0], [0.03, 0, 0.12]],
-limits: [[0, 4], [-130, 130], [-110, -10], [20, 130], [-150, 150], [-100, 100], [-150, 150]]}
+limits: [[0, 4], [-130, 130], [-110, -10], [20, 130], [-150, 150], [-100, 100], [-150, 150]],
+gears: [0.2666667, null, null, null, null, null, null]}
 """
 ERRORS = "rails bends gain racks pinion play tilt geometry springs bearings waves pins heat"
 

@@ -97,8 +97,21 @@ def default_shape(situation: Situation, effect: Effect) -> Tensor:
 def textbook_shapes(situation: Situation, effect: Effect) -> tuple[Tensor, tuple[int, ...]]:
     """The shapes for which nobody needs to look, `h` (once a turn, for one), and the coefficients that none depends on
     for which one has to."""
+    return _known_shapes(situation, effect, [s.textbook for s in effect.shapes(situation)])
+
+
+def told_shapes(situation: Situation, effect: Effect) -> tuple[Tensor, tuple[int, ...]]:
+    """As `textbook_shapes`, at the shapes that the machine's file tells; no coefficients where it tells none."""
+    told = [s.told for s in effect.shapes(situation)]
+    value, used = _known_shapes(situation, effect, told)
+    return value, used if any(v is not None for v in told) else ()
+
+
+def _known_shapes(
+    situation: Situation, effect: Effect, known: Sequence[float | None]
+) -> tuple[Tensor, tuple[int, ...]]:
     shapes, count = effect.shapes(situation), len(effect.coefficients(situation))
-    value = [s.grid[0] if s.textbook is None else s.textbook for s in shapes]
-    searched = {c for s in shapes if s.textbook is None for c in s.columns or range(count)}
+    value = [s.grid[0] if v is None else v for s, v in zip(shapes, known, strict=True)]
+    searched = {c for s, v in zip(shapes, known, strict=True) if v is None for c in s.columns or range(count)}
     used = tuple(k for k in range(count) if k not in searched)
     return torch.tensor(value, dtype=situation.joints.dtype, device=situation.joints.device), used

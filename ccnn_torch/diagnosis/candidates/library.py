@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.candidates.atom import Atom, default_shape, textbook_shapes
+from ccnn_torch.diagnosis.candidates.atom import Atom, default_shape, textbook_shapes, told_shapes
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows, Shaped
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.rows import only_usable
@@ -168,11 +168,10 @@ def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped
 
 
 def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
-    """The shapes of the textbook, which need no search; none where an effect has no such ones."""
-    value, used = textbook_shapes(situation, effect)
-    if not used:
-        return []
-    return [Shaped(value, None if len(used) == len(effect.coefficients(situation)) else used, 0.0)]
+    """The shapes of the textbook and of the machine's file, which need no search; none where there are no such ones."""
+    known = [shapes(situation, effect) for shapes in (textbook_shapes, told_shapes)]
+    count = len(effect.coefficients(situation))
+    return [Shaped(value, None if len(used) == count else used, 0.0) for value, used in known if used]
 
 
 def _charged(atom: Atom) -> Atom:

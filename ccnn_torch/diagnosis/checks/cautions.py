@@ -237,8 +237,8 @@ def _numbers(analysis: Analysis, judgement: Judgement) -> Iterator[tuple[str, tu
     plausible sizes."""
     found = judgement.acting
     sd = covariance(analysis.dictionary, found).diagonal().clamp_min(1e-300).sqrt()
-    each = zip(found.members, found.mean, sd.split([len(mean) for mean in found.mean]), strict=True)
-    for i, mean, own in each:
+    own_of = torch.split(sd, [len(mean) for mean in found.mean])
+    for i, mean, own in zip(found.members, found.mean, own_of, strict=True):
         atom = analysis.atoms[i]
         if atom.name in judgement.names and (coefficients := atom.coefficients(analysis.situation)):
             yield atom.name, coefficients, mean, own

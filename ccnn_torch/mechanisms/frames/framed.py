@@ -88,8 +88,7 @@ class Framed(Around):
             home_pose=_coordinates(*start).tolist(),
             home_joints=inner.home_joints.tolist(),
         )
-        self.mechanism = inner
-        self.takes = inner.takes
+        self.mechanism, self.takes, self.gears = inner, inner.takes, inner.gears
         self.base, self.tool, self.rotation_weight = base, tool, rotation_weight
         self.frame_per, self.tool_per = tuple(frame_per), tuple(tool_per)
         # Where the coordinates of the mechanism's pose are those of its frame there is nothing to search.

@@ -36,7 +36,10 @@ KINDS = tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 _BARE = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*")
 _TOLERANCE = re.compile(r"\+-|±")
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
-_OF_ARMS = ("base_frame", "tool_frame", "tool_offset", "limits", "pitch_errors", "orientation", "frame_per", "tool_per")
+_OF_ARMS = (
+    *("base_frame", "tool_frame", "tool_offset", "orientation", "frame_per", "tool_per"),
+    *("limits", "gears", "pitch_errors"),
+)
 _FRAME = ("m", "m", "m", "rad", "rad", "rad")
 
 
@@ -119,11 +122,8 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         offset = content["tool_offset"]
         point = [*offset, 0, 0, 0] if isinstance(offset, list) else offset
         frames["tool"] = _frame(point, f"{where}: tool_offset")
-    travel, joints = content.get("limits") or {}, [f"q{i + 1}" for i in range(len(moves))]
-    if not isinstance(travel, Mapping):
-        raise InputError(f"{where}: limits: must be as {{q1: [0 mm, 500 mm]}}, not {travel!r}")
-    _check_names([str(key) for key in travel], joints, f"{where}: limits:")
-    limits = {**about["limits"], **travel}
+    joints = [f"q{i + 1}" for i in range(len(moves))]
+    limits = {**about["limits"], **_by_joint(content, "limits", "{q1: [0 mm, 500 mm]}", joints, where)}
     return SerialArm(
         name=name,
         convention="urdf",
@@ -143,20 +143,45 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         drives=[(int(d[5]), int(d[6])) for e in about["numbers"].values() for d in e["of"] if d.startswith("drive")],
         numbers=numbers,
         tables=_tables(content, joints, moves, where),
+        gears=_gears(content, joints, moves, where),
     )
+
+
+def _by_joint(content: Mapping[str, Any], key: str, form: str, joints: Sequence[str], where: str) -> Mapping[str, Any]:
+    """What a key tells of some of the joints, by name."""
+    given = content.get(key) or {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"{where}: {key}: must be as {form}, not {given!r}")
+    _check_names([str(name) for name in given], [*joints], f"{where}: {key}:")
+    return given
+
+
+def _gears(
+    content: Mapping[str, Any], joints: Sequence[str], moves: Sequence[Sequence[str]], where: str
+) -> list[float | None]:
+    """Turns of each joint's motor for one of its own [1], or the lead of its screw [m]; none where none is told."""
+    given = _by_joint(content, "gears", "{q1: 80, q3: 20 mm}", joints, where)
+    found: list[float | None] = [None] * len(joints) if given else []
+    for i, (joint, (how, _)) in enumerate(zip(joints, moves, strict=True)):
+        if joint in given:
+            about = f"{where}: gears.{joint}"
+            text, unit = visible(str(given[joint])), "1" if how == "turn" else "m"
+            if unit == "m" and _BARE.fullmatch(text):
+                raise InputError(f"{about}: '{text}' has no unit; write {text} mm")
+            found[i] = value = _amount(text, unit, about)
+            if value <= 0:
+                raise InputError(f"{about}: must be above 0, not {text}")
+    return found
 
 
 def _tables(
     content: Mapping[str, Any], joints: Sequence[str], moves: Sequence[Sequence[str]], where: str
 ) -> list[list[list[float]] | None] | None:
     """Places and errors of each joint's pitch-error table [SI], None of one without; None where there is none."""
-    given = content.get("pitch_errors")
-    if given is None:
+    form = "{q1: {at: [0 mm, 250 mm], error: [0 um, 3 um]}}"
+    given = _by_joint(content, "pitch_errors", form, joints, where)
+    if not given:
         return None
-    written = f"{where}: pitch_errors: must be as {{q1: {{at: [0 mm, 250 mm], error: [0 um, 3 um]}}}}"
-    if not isinstance(given, Mapping):
-        raise InputError(f"{written}, not {given!r}")
-    _check_names([str(key) for key in given], list(joints), f"{where}: pitch_errors:")
     found: list[list[list[float]] | None] = []
     for joint, (how, _) in zip(joints, moves, strict=True):
         table, unit = given.get(joint), "rad" if how == "turn" else "m"
@@ -165,7 +190,7 @@ def _tables(
             continue
         rows = [table.get(key) or [] for key in ("at", "error")] if isinstance(table, Mapping) else []
         if len(rows) != 2 or not all(isinstance(row, list) for row in rows):
-            raise InputError(f"{written}, not {joint}: {table!r}")
+            raise InputError(f"{where}: pitch_errors: must be as {form}, not {joint}: {table!r}")
         found.append([[_amount(v, unit, f"{where}: pitch_errors.{joint}") for v in row] for row in rows])
     return found
 
@@ -311,6 +336,9 @@ def template(kind: str) -> str:
             *(f"{key}: {_written(about[key])}" for key in ("base_frame", "tool_frame")),
             "# Travel of the joints.",
             f"limits: {{{ends}}}",
+            "# Drives that are known, at whose periods errors are looked for: turns of the motor for one of the joint,",
+            "# or the lead of a screw:",
+            f"# gears: {{q1: {'10 mm' if about['chain'][0].startswith('slide') else 100}}}",
             "# A table of pitch errors that is known (positive = it goes too far); what is found is then beyond it:",
             "# pitch_errors: {q1: {at: [0 mm, 250 mm, 500 mm], error: [0 um, 3 um, -2 um]}}",
         ]

@@ -61,6 +61,8 @@ class Pair(Mechanism):
             home_joints=start.tolist(),
         )
         self.first, self.second = first, second
+        told = [arm.gears or (None,) * len(arm.joints) for arm in (first, second)]
+        self.gears = (*told[0], *told[1])
 
     def _own_file(self) -> dict[str, Any]:
         return {"spec": "pair", "keys": {"first": self.first.describe(), "second": self.second.describe()}}

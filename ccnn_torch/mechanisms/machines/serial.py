@@ -45,7 +45,7 @@ MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
 
 # Keys of a description that is older than these, or has none of them, are not there.
-_WHERE_GIVEN = ("goal_tool", "tables", "leans", "masses", "centres")
+_WHERE_GIVEN = ("goal_tool", "tables", "leans", "masses", "centres", "gears")
 FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
 
@@ -111,6 +111,7 @@ class SerialArm(Closest):
         leans: Sequence[Sequence[float]] = (),
         masses: Sequence[float] = (),
         centres: Sequence[Sequence[float]] = (),
+        gears: Sequence[float | None] = (),
     ) -> None:
         """Build from plain numbers [SI].
 
@@ -131,6 +132,7 @@ class SerialArm(Closest):
             masses: of the links, `n` [kg]; unknown when there are none.
             centres: of mass of the links, each in the frame at its link's end, `n x 3` [m]; of an empty one halfway
                 from its joint's axis to the next.
+            gears: as of `Mechanism`.
             numbers: fields of a `Parameter`, and `of`: what one unit of it adds to links' and drives' parameters, by
                 name; `links` are then what is there without them.
 
@@ -175,7 +177,7 @@ class SerialArm(Closest):
         )
         self.convention, self.orientation, self.rotation_weight = convention, orientation, rotation_weight
         self.unknown_frames, self.parallel_axes = tuple(sorted(unknown)), tuple(map(tuple, parallel_axes))
-        self.frame_per, self.tool_per = tuple(frame_per), tuple(tool_per)
+        self.frame_per, self.tool_per, self.gears = tuple(frame_per), tuple(tool_per), tuple(gears)
         turn = [t == "revolute" for t in types]
         span = limits or [(-math.pi, math.pi) if t else (0.0, 1.0) for t in turn]
         self.register_buffer("axes", torch.tensor(axes or [[0.0, 0.0, 1.0]] * n, dtype=torch.float64))
