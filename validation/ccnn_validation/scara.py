@@ -6,8 +6,8 @@ other lengths, axes that are not parallel, zeros, harmonic drives of ratio 80 an
 the motor, eccentric encoders, a quill on a ball screw spline (error of its lead that grows, bends and returns with each
 turn, a nut that runs out, a twisted spline), play, arms and bearings that bend under weight and payload, arms that
 grow, zeros that drift. Ours (`ccnn run`, by the written file) has a Denavit-Hartenberg table, or the machine file of a
-SCARA ("own words"). The plain SciPy script knows the screw's lead, and the gears' ratios or not. Judged in the frame
-and at the tool point that suit best; "a reading" is what a reading of the tracker is off.
+SCARA ("own words"), both with the gears' ratios and the screw's lead, as the plain SciPy script knows them; another
+one does not know the ratios. Judged in the frame and at the tool point that suit best; "a reading" is what a reading of the tracker is off.
 """
 
 from __future__ import annotations
@@ -36,11 +36,13 @@ LIMITS = "limits: {q1: [-160 deg, 160 deg], q2: [-145 deg, 145 deg], q3: [-190 m
 FILE = """{robot: scara, dof: 4, convention: standard Denavit-Hartenberg, units: {length: m, angle: deg},
 joint_types: [revolute, revolute, prismatic, revolute], a: [0.4, 0.3, 0, 0], alpha: [0, 0, 0, 0], d: [0.35, 0, 0, 0],
 theta: [0, 0, 0, 0], masses: [14, 9, 1, 1], centres: [[-0.23, 0, 0], [-0.14, 0, 0], [0, 0, 0], [0, 0, 0]],
-base_frame: unknown, tool_offset: unknown, limits: [[-160, 160], [-145, 145], [-0.19, 0.01], [-185, 185]]}
+base_frame: unknown, tool_offset: unknown, limits: [[-160, 160], [-145, 145], [-0.19, 0.01], [-185, 185]],
+gears: [80, 50, 0.02, null]}
 """
 WORDS = f"""machine: scara
 base_frame: unknown
 tool_frame: unknown
+gears: {{q1: 80, q2: 50, q3: 20 mm}}
 {LIMITS}numbers: {{upper_arm: 400 mm +- 0.5 mm, forearm: 300 mm +- 0.5 mm, zero_2: 0 deg +- 0.1 deg,
   tilt_2x: 0 um/m +- 500 um/m, tilt_2y: 0 um/m +- 500 um/m, tilt_quill_x: 0 um/m +- 500 um/m,
   tilt_quill_y: 0 um/m +- 500 um/m, lead_z: 0 um/m +- 300 um/m, quill_coupling: 0 mm/turn +- 0.02 mm/turn}}
