@@ -37,9 +37,9 @@ _DEGREES = 16
 
 
 def _slide(degree: int) -> _Form:
-    """As large as of a path whose slope is random: the mean square falls with the square of the degree."""
+    """As large as of a path whose slope is random."""
     part = "waves" if 4 < degree <= _DEGREES // 2 else "short waves" if degree > 4 else ""
-    return _Form(str(degree), math.sqrt(2 * degree + 1) / degree, degree > 2, part)
+    return _Form(str(degree), 1 / math.sqrt(2 * degree - 1), degree > 2, part)
 
 
 _SLIDES = tuple(_slide(degree) for degree in range(1, _DEGREES + 1))
@@ -55,7 +55,7 @@ def _along(slides: bool, at: Tensor) -> list[Tensor]:
     found = [torch.ones_like(at), at]
     for k in range(2, _DEGREES + 1):
         found.append(((2 * k - 1) * at * found[-1] - (k - 1) * found[-2]) / k)
-    return found[1:]
+    return [at, *(one - other for one, other in zip(found[2:], found[:-2], strict=True))]
 
 
 # Of machine tools as built over a metre [m], [rad] (ISO 10791-1); the rows say what it is here.
