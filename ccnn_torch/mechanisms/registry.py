@@ -29,6 +29,7 @@ from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 from ccnn_torch.plugins import class_hint, code_refused, file_that_names, is_plugin, load_plugin, users_code
 from ccnn_torch.spelling import hint
+from ccnn_torch.units import amount
 
 _POSES, _STEPS = 256, 8
 # A walk whose joints change by more than this in a step, or that differs by less from the direct answer, is not
@@ -368,12 +369,24 @@ def _maker(spec: str) -> Callable[..., Any]:
     raise InputError(f"unknown mechanism '{spec}'; {near} Otherwise give {_FORMS}")
 
 
+# Of keys of built-in mechanisms that are no lengths; None = any.
+_UNITS = {**dict.fromkeys(("gamma", "lean", "base_spread", "platform_spread"), "rad"), "rotation_weight": None}
+
+
 def _call(spec: str, maker: Callable[..., Any], keys: Mapping[str, Any]) -> Any:
-    """Call with the keys; a key too many or missing becomes a sentence."""
+    """Call with the keys, those of a built-in one with numbers in SI; a key too many or missing becomes a sentence."""
     signature = inspect.signature(maker)
     try:
         signature.bind(**keys)
     except TypeError as error:
         takes = ", ".join(signature.parameters) or "no keys"
         raise InputError(f"mechanism '{spec}': {error}; it takes {takes}") from None
-    return maker(**keys)
+    numbers = {name: p.default for name, p in signature.parameters.items()} if spec in REGISTRY else {}
+    return maker(
+        **{
+            name: amount(str(value), _UNITS.get(name, "m"), f"mechanism '{spec}': {name}")
+            if isinstance(numbers.get(name), float) and not isinstance(value, int | float)
+            else value
+            for name, value in keys.items()
+        }
+    )

@@ -1,6 +1,7 @@
 """Mechanisms by name, by file and from a description."""
 
 import json
+import math
 
 import pytest
 import torch
@@ -19,6 +20,18 @@ def test_by_name_with_keys():
         load_mechanism("xyz")
     with pytest.raises(InputError, match="'radius'; it takes L, r"):
         load_mechanism("tripod", radius=3)
+
+
+def test_keys_with_units():
+    bar = load_mechanism("five_bar", l="220 mm", L="0.28", a=0.08)
+    assert bar.nominal[:3].tolist() == [0.22, 0.28, -0.08]
+    assert torch.equal(mechanism_from_description(bar.describe()).nominal, bar.nominal)
+    assert load_mechanism("delta_linear", lean="2 deg").nominal[2] == math.radians(2)
+    for value in ("long", [0.2], None):
+        with pytest.raises(InputError, match=r"mechanism 'five_bar': l: '.*' is no number with a unit"):
+            load_mechanism("framed", mechanism="five_bar", keys={"l": value})
+    with pytest.raises(InputError, match="mechanism 'five_bar': l is in 'deg', an angle, but must be a length"):
+        load_mechanism("five_bar", l="220 deg")
 
 
 def test_users_file(tmp_path):
