@@ -375,7 +375,8 @@ def tool_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
     there, own = (", ".join(f"{1e3 * float(v):.1f}" for v in tool) for tool in (values[-6:-3], arm.nominal[-6:-3]))
     return (
         f"the measured point seems to be at {there} mm from the flange and not at {own} mm, which leaves "
-        f"{1e3 * left:.3g} mm; correct tool_offset in its file, or write tool_offset: unknown to have it fitted"
+        f"{1e3 * left:.3g} mm; correct tool_offset in its file, or write tool_offset: unknown (in place of "
+        "tool_frame, where that is there) to have it fitted"
     )
 
 
