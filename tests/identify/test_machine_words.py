@@ -281,6 +281,7 @@ def test_the_screen_has_the_terms_of_the_telescope_that_is_shipped(tmp_path: Pat
     words = (f"records={data / 'telescope.csv'}", f"mechanism={data / 'telescope.yaml'}", "save_report=false")
     code, screen, said = cli("identify", *words, "--out", tmp_path / "found")
     assert code == 0 and "all 6 values are determined" in screen, said
+    assert "are in identified.json; --details shows them here." in " ".join(screen.split())
     lines = dict(line.strip().rsplit(": ", 1) for line in screen.splitlines() if " ± " in line)
     truth = {"IA": 412.0, "IE": -85.0, "CA": 34.0, "NPAE": -27.0, "AN": 61.0, "AW": -48.0}
     assert {name.split(" ")[-1] for name in lines} == set(truth) and "┃" not in screen
