@@ -172,8 +172,18 @@ def diagnose(
     notes = [*records.missing, *said.notes, *mounted, *_unread(records, situation, said)]
     doubts = [*said.cautions, *([records.doubt] if records.doubt else [])]
     entries = {"notes": notes, "cautions": doubts, "machine": named_machine(said), "frames": frames_taken(said)}
+    still = constant_columns(records)
+    entries["missing_covariates"] = [
+        e | {"constant": still >= {c.partition("[")[0] for c in e["columns"]}}
+        for e in said.content["missing_covariates"]
+    ]
     said = replace(said, lines=tuple(records.lines.tolist())).with_entries(**entries)
     return with_network(said, seed) if network else said
+
+
+def constant_columns(records: Records) -> set[str]:
+    """Columns beside joints and pose that never change."""
+    return {name for name, values in records.columns.items() if np.ptp(values) == 0}
 
 
 def _mounts(records: Records, situation: Situation) -> dict[str, Tensor]:
