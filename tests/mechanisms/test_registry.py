@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from catalogue import FIVE_BAR, NAMES, UR10, make
 from five_bar import FiveBar
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms import Tripod, load_mechanism, mechanism_from_description
 
 
@@ -32,6 +34,18 @@ def test_keys_with_units():
             load_mechanism("framed", mechanism="five_bar", keys={"l": value})
     with pytest.raises(InputError, match="mechanism 'five_bar': l is in 'deg', an angle, but must be a length"):
         load_mechanism("five_bar", l="220 deg")
+
+
+@pytest.mark.parametrize("name", ["framed", "partial", "instrument", "pair", "machine"])
+def test_a_mechanism_around_another_says_what_to_write(name, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match=f"'{name}': needs .*; write e.g. mechanism_keys: {{.*}} into the") as refused:
+        load_mechanism(name)
+    monkeypatch.chdir(tmp_path)
+    for file in ("my_arm", "left", "right"):
+        (tmp_path / f"{file}.yaml").write_text(re.sub(r"unknown[^\n]*", "identity", UR10))
+    said = str(refused.value)
+    keys = parse_yaml(said[said.index("{") : said.rindex("}") + 1], "said")
+    assert len(load_mechanism(name, **keys).geometry) > 9
 
 
 def test_users_file(tmp_path):
