@@ -300,9 +300,15 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
             return
         outside = np.flatnonzero((records.whole & ~reachable(records.pose)).numpy())
         if len(outside):
+            keys = f"mechanism_keys: {{mechanism: {mechanism.name}, keys: {{…}}}}"
+            framed = f"mechanism: framed and {keys} into the config"
+            arm = "base_frame: unknown into its file"
+            other = "; if poses are measured in another frame than the machine's own, write "
+            other += arm if hasattr(mechanism, "unknown_frames") else framed
             raise InputError(
                 f"{records.path}: the pose at {records.name_rows(outside)} is outside the workspace of "
                 f"{mechanism.name}; correct or remove {'it' if len(outside) == 1 else 'them'}, or check the units"
+                f"{other if len(outside) > _MANY * len(records) else ''}"
             )
         return
     reach = getattr(mechanism, "reach", None)
