@@ -300,11 +300,11 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
             return
         outside = np.flatnonzero((records.whole & ~reachable(records.pose)).numpy())
         if len(outside):
-            keys = f"mechanism_keys: {{mechanism: {mechanism.name}, keys: {{…}}}}"
-            framed = f"mechanism: framed and {keys} into the config"
-            arm = "base_frame: unknown into its file"
-            other = "; if poses are measured in another frame than the machine's own, write "
-            other += arm if hasattr(mechanism, "unknown_frames") else framed
+            other = "; if poses are measured in another frame than the machine's own, write " + (
+                "base_frame: unknown into its file"
+                if hasattr(mechanism, "convention")
+                else "mechanism: framed, and the mechanism and its keys as mechanism_keys: {mechanism: …, keys: {…}}"
+            )
             raise InputError(
                 f"{records.path}: the pose at {records.name_rows(outside)} is outside the workspace of "
                 f"{mechanism.name}; correct or remove {'it' if len(outside) == 1 else 'them'}, or check the units"
