@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -196,6 +197,11 @@ def test_rows_beyond_the_limits_of_the_file_say_so(tmp_path: Path) -> None:
     write_table(tmp_path / "r.csv", columns)
     found = load_records(str(tmp_path / "r.csv"), load_mechanism(str(tmp_path / "gantry.yaml")))
     assert "beyond the limits of the machine's file (key limits), q3 in 30 of 30 rows" in found.doubt
+    assert "hardly any" not in found.doubt
+    wide = re.sub("limits: {[^}]*", "limits: {q3: [-190 m, 10 m]", template("gantry"))
+    (tmp_path / "gantry.yaml").write_text(wide)
+    found = load_records(str(tmp_path / "r.csv"), load_mechanism(str(tmp_path / "gantry.yaml")))
+    assert "file, q3 0.27 m of 200 m: check the unit of its limits" in re.sub(r"0\.2\d+", "0.27", found.doubt)
 
 
 def _printer(folder: Path) -> Path:
