@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import os
 import re
@@ -19,7 +18,7 @@ from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.mechanisms.dh_file import urdf_joints
 from ccnn_torch.mechanisms.frames.judge import coupled_count
-from ccnn_torch.mechanisms.registry import REGISTRY
+from ccnn_torch.mechanisms.registry import REGISTRY, dimensions
 from ccnn_torch.motion.log import load_logs
 from ccnn_torch.records import DEFAULT_COVARIATES
 from ccnn_torch.records.commanded import GOAL
@@ -423,11 +422,10 @@ def _mechanism_lines(name: str | None, why: str, out: Path) -> list[str]:
 
 def _dimension_lines(name: str) -> list[str]:
     """The dimensions that a built-in machine is taken to have."""
-    parameters = inspect.signature(REGISTRY[name]).parameters.values() if name in REGISTRY else ()
-    sizes = [f"{p.name}: {p.default:g}" for p in parameters if isinstance(p.default, float)]
+    sizes = dimensions(name)
     if not sizes:
         return []
-    return ["# Its dimensions [m, rad]; write those of your machine:", f"# mechanism_keys: {{{', '.join(sizes)}}}"]
+    return ["# Its dimensions [m, rad]; write those of your machine:", f"# mechanism_keys: {{{sizes}}}"]
 
 
 def _column_lines(columns: dict[str, str], found: Recognised, table: Table, why: str) -> list[str]:

@@ -147,7 +147,7 @@ def test_own_records_train_compensate_and_come_back(cli: Cli, tmp_path: Path) ->
         "run", EXPERIMENTS / "records.yaml", f"records={records}", "mechanism=tripod", f"out={out}", *QUICK
     )
     assert code == 0, err
-    assert "position" in shown
+    assert "position" in shown and "are in results.json; --details shows them here." in " ".join(shown.split())
     results = json.loads((out / "results.json").read_text())
     position = results["pose"]["position"]
     # The same 0.1 mm everywhere: whatever learns at all takes nearly all of it away.

@@ -142,6 +142,28 @@ def test_a_direction_that_is_no_sign_is_named(cli: Cli, rows: Path) -> None:
     assert code == 2 and "column 'direction2', line 6: 0.5 is no direction; write 1 or -1" in told
 
 
+def test_directions_that_never_change_are_not_to_be_recorded_but_changed(cli: Cli, rows: Path, tmp_path: Path) -> None:
+    write_simulated(rows, simulate_records("five_bar", ["joint_offset"], 80, 1e-5, seed=4))
+    head, *lines = rows.read_text(encoding="utf-8").splitlines()
+    assert head.endswith(",direction1[1],direction2[1]")
+    rows.write_text("\n".join([head, *(f"{line.rsplit(',', 2)[0]},1,1" for line in lines)]) + "\n", encoding="utf-8")
+    code, shown, told = cli("check", "--config", tmp_path / "config.yaml")
+    assert code == 0, told
+    assert "direction1[1]…direction2[1], which never change: approach the joints from both sides." in _line(shown)
+    code, shown, told = cli("diagnose", "--config", tmp_path / "config.yaml", "--out", tmp_path / "found")
+    assert code == 0, told
+    measure = _line(shown).partition("Measure next:")[2]
+    assert "direction" not in measure.partition("Record as well:")[2].partition("Recorded, but")[0]
+    assert "never changing: direction1[1], direction2[1] (would show" in measure
+    assert "): approach the joints from both sides." in measure
+    still = json.loads((tmp_path / "found/diagnosis.json").read_text(encoding="utf-8"))["missing_covariates"]
+    assert {tuple(entry["columns"]) for entry in still if entry["constant"]} == {("direction1[1]", "direction2[1]")}
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -74,6 +74,15 @@ def test_from_strange_headers_to_a_finished_run(tmp_path: Path, cli: Cli) -> Non
     assert cli("new", records, "--units", "mm,deg", "--mechanism", "delta", "--out", config, "--force")[0] == 0
 
 
+def test_a_mechanism_that_is_built_in_needs_no_file(tmp_path: Path, cli: Cli) -> None:
+    code, _, told = cli("new", "--mechanism", "five_bar", "--out", tmp_path / "a.yaml")
+    assert code == 2 and "write mechanism: five_bar and mechanism_keys: {l: 0.75, L: 1.1, a: 0.5} into the" in told
+    code, _, told = cli("new", "--mechanism", "framed", "--out", tmp_path / "a.yaml")
+    assert code == 2 and "mechanism_keys: {mechanism: five_bar, keys: {l: 220 mm, " in told
+    code, _, told = cli("new", "--mechanism", "serial", "--out", tmp_path / "a.yaml")
+    assert code == 2 and "the kind of machine 'serial' is not known" in told and not list(tmp_path.iterdir())
+
+
 def test_a_mechanism_is_guessed_only_where_one_fits(tmp_path: Path, cli: Cli) -> None:
     headers = ["q1[deg]", "q2[deg]", "q3[deg]", "x[mm]", "y[mm]", "z[mm]"]
     text, ready = starter_config(write(tmp_path / "a.csv", headers, delta()), tmp_path / "a.yaml")

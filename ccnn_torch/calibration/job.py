@@ -80,7 +80,8 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, 
             run_page(calibration.results).show(stdout)
             raise
     if details is not None and not quiet:
-        run_page(calibration.results, folder=folder.path).show(stdout, details)
+        where = "the report" if config.save_report else "results.json"
+        run_page(calibration.results, folder=folder.path).show(stdout, details, where)
         place = typed_path(str(folder.path))
         say_place(f"Everything is in {place}" + (f"; open {place}/report.html" if config.save_report else ""))
 

@@ -19,7 +19,7 @@ from ccnn_torch.diagnosis.from_file import (
     usable_verdict,
     with_numbers,
 )
-from ccnn_torch.diagnosis.from_records import in_own_base, situation_of
+from ccnn_torch.diagnosis.from_records import in_own_base, named_mistake, situation_of
 from ccnn_torch.diagnosis.joint_fit import effects_that_pay, fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.diagnosis.residual.linearisation import remainder
 from ccnn_torch.diagnosis.residual.rows import picked
@@ -277,7 +277,10 @@ def frames_of_repeats(mechanism: Mechanism, records: Records, splits: list[Split
     notes = []
     if isinstance(mechanism, SerialArm):
         about = (records.joints, records.pose, parameters, weights, records.path, records.name_rows)
-        notes += judge_frames(mechanism, *about)
+        try:
+            notes += judge_frames(mechanism, *about)
+        except InputError as reason:
+            raise named_mistake(reason, mechanism, records, parameters[0].squeeze(0)) from None
     unknown = " and ".join(getattr(mechanism, "unknown_frames", ()))
     notes.append(f"Frames fitted first, on the training rows of each repeat: {unknown}.")
     return parameters, notes

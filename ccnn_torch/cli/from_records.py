@@ -78,7 +78,7 @@ def new(
     if out is None:
         raise InputError("--out: name the config to write, e.g. --out robot.yaml")
     from ccnn_torch.files.write import write_whole
-    from ccnn_torch.mechanisms.kinds.machine_file import template
+    from ccnn_torch.mechanisms.registry import machine_text
     from ccnn_torch.records.formats.klipper import printer_files, read_printer
     from ccnn_torch.starter import command_of, starter_config
 
@@ -88,7 +88,7 @@ def new(
     if there:
         raise InputError(f"{there[0]} is there already; name another file, or give --force to overwrite it")
     if records is None:
-        write_whole(out, template(str(mechanism)).encode())
+        write_whole(out, machine_text(str(mechanism)).encode())
         if not quiet:
             typer.echo(f"{out} is written. Write your machine's numbers into it, then use it as mechanism={out}")
         return

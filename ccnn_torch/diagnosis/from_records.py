@@ -172,8 +172,18 @@ def diagnose(
     notes = [*records.missing, *said.notes, *mounted, *_unread(records, situation, said)]
     doubts = [*said.cautions, *([records.doubt] if records.doubt else [])]
     entries = {"notes": notes, "cautions": doubts, "machine": named_machine(said), "frames": frames_taken(said)}
+    still = constant_columns(records)
+    entries["missing_covariates"] = [
+        e | {"constant": still >= {c.partition("[")[0] for c in e["columns"]}}
+        for e in said.content["missing_covariates"]
+    ]
     said = replace(said, lines=tuple(records.lines.tolist())).with_entries(**entries)
     return with_network(said, seed) if network else said
+
+
+def constant_columns(records: Records) -> set[str]:
+    """Columns beside joints and pose that never change."""
+    return {name for name, values in records.columns.items() if np.ptp(values) == 0}
 
 
 def _mounts(records: Records, situation: Situation) -> dict[str, Tensor]:
@@ -247,7 +257,7 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
         try:
             judge_frames(mechanism, records.joints, records.pose, parameters, None, records.path, records.name_rows)
         except InputError as reason:
-            raise _named(reason, mechanism, records, parameters) from None
+            raise named_mistake(reason, mechanism, records, parameters) from None
     down = default_gravity(mechanism) if gravity is None else torch.tensor(list(gravity), dtype=torch.float64)
     if down.shape != (3,):
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
@@ -268,13 +278,14 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
     return situation
 
 
-def _named(reason: InputError, arm: SerialArm, records: Records, parameters: Tensor) -> InputError:
+def named_mistake(reason: InputError, arm: SerialArm, records: Records, parameters: Tensor) -> InputError:
     """The refusal of fitted frames, with the mistake that explains it in place of what to check, where there is one."""
     if "joint_map" in str(reason):
         return reason
     rows = Situation(arm, records.joints, {}, default_gravity(arm), parameters, records.pose)
     said = what_is_wrong(rows, records.pose, size_of(rows))
-    return InputError(f"{str(reason).partition('; check')[0]}: {said}") if said else reason
+    until, then = ("; check", f": {said}") if said else ("; ccnn check", "")
+    return InputError(str(reason).partition(until)[0] + then)
 
 
 def _refuse_no_sign(records: Records, covariates: Mapping[str, Tensor]) -> None:

@@ -13,13 +13,14 @@ from ccnn_torch.config.sizes import noise_of_pose
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of, with_network
 from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
 from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
-from ccnn_torch.diagnosis.from_records import naming
+from ccnn_torch.diagnosis.from_records import constant_columns, naming
 from ccnn_torch.diagnosis.page.data import RESULT, About, about_of, load_labels
 from ccnn_torch.diagnosis.page.first_screen import first_screen
 from ccnn_torch.diagnosis.page.outputs import write_diagnosis, write_result
 from ccnn_torch.diagnosis.page.report import print_diagnosis
 from ccnn_torch.diagnosis.progress import TO_REPORT, TO_VERDICT, watched
 from ccnn_torch.diagnosis.result import Said
+from ccnn_torch.diagnosis.verdict.text import both_sides
 from ccnn_torch.display import short_path, typed_path
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.time import Homing
@@ -97,7 +98,13 @@ def run_check(config: DiagnoseConfig) -> Check:
     with naming(records):
         found = check_rows(situation, records.pose, noise_of(_noise(config, records), situation), effects)
     doubts = [*found.cautions, *([records.doubt] if records.doubt else [])]
-    return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside], cautions=doubts)
+    still = constant_columns(records)
+    missing = {
+        name: f"{why}, which never change{both_sides(why)}" if any(f"{c}[" in why for c in still) else why
+        for name, why in found.missing.items()
+    }
+    lines = [int(records.lines[row]) for row in found.aside]
+    return replace(found, lines_aside=lines, cautions=doubts, missing=missing)
 
 
 def _verdict(config: DiagnoseConfig, tell: Callable[..., None]) -> Diagnosis:

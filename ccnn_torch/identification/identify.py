@@ -242,7 +242,8 @@ def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, de
         found = identify(config, path / "methods", watch)
     if details is not None and not quiet:
         # Before anything is written: what was found is not lost where the disk is full.
-        identified_page(found.results, folder=typed_path(str(path))).show(stdout, details)
+        where = "the report" if config.save_report else RESULTS
+        identified_page(found.results, folder=typed_path(str(path))).show(stdout, details, where)
     note("writing tables, plots and files …", quiet)
     with resume_hint(f"ccnn identify --resume {path}"):
         write_outputs(found, path)

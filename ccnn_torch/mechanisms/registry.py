@@ -15,7 +15,7 @@ from ccnn_torch.mechanisms.dh_file import read_dh_file, read_urdf
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.frames.instrument import Instrument, instrument
 from ccnn_torch.mechanisms.frames.partial import Partial, Seen
-from ccnn_torch.mechanisms.kinds.machine_file import build_machine, read_machine_file
+from ccnn_torch.mechanisms.kinds.machine_file import build_machine, read_machine_file, template
 from ccnn_torch.mechanisms.machines.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.machines.five_bar import FiveBar
 from ccnn_torch.mechanisms.machines.overconstrained import Overconstrained2Dof
@@ -29,6 +29,7 @@ from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 from ccnn_torch.plugins import class_hint, code_refused, file_that_names, is_plugin, load_plugin, users_code
 from ccnn_torch.spelling import hint
+from ccnn_torch.units import amount
 
 _POSES, _STEPS = 256, 8
 # A walk whose joints change by more than this in a step, or that differs by less from the direct answer, is not
@@ -368,12 +369,64 @@ def _maker(spec: str) -> Callable[..., Any]:
     raise InputError(f"unknown mechanism '{spec}'; {near} Otherwise give {_FORMS}")
 
 
+# Keys of what is made of another mechanism, as examples.
+_EXAMPLES = {
+    "framed": "mechanism: five_bar, keys: {l: 220 mm, L: 280 mm, a: 80 mm}",
+    "partial": "mechanism: my_arm.yaml, pose: [x, y, z]",
+    "instrument": "mechanism: my_arm.yaml, kind: wire, anchors: 2",
+    "pair": "first: left.yaml, second: right.yaml",
+    "machine": "machine: gantry",
+}
+
+
+def dimensions(name: str) -> str:
+    """Names and values of the dimensions that a built-in machine is taken to have; empty for others."""
+    takes = inspect.signature(REGISTRY[name]).parameters.values() if name in REGISTRY else ()
+    sizes = [p for p in takes if isinstance(p.default, float) and _UNITS.get(p.name, "m")]
+    return ", ".join(f"{p.name}: {p.default:g}" for p in sizes)
+
+
+def machine_text(kind: str) -> str:
+    """Text of a machine file of a kind, to be filled in.
+
+    Raises:
+        InputError: there is no such kind; of a mechanism that is built in it says what to write.
+    """
+    keys = _EXAMPLES.get(kind) or dimensions(kind)
+    if keys:
+        raise InputError(
+            f"--mechanism {kind}: is built in and needs no file; write mechanism: {kind} and "
+            f"mechanism_keys: {{{keys}}} into the config, with the numbers of your machine in m and rad, or with "
+            "units, e.g. 220 mm"
+        )
+    return template(kind)
+
+
+# Of keys of built-in mechanisms that are no lengths; None = any.
+_UNITS = {**dict.fromkeys(("gamma", "lean", "base_spread", "platform_spread"), "rad"), "rotation_weight": None}
+
+
 def _call(spec: str, maker: Callable[..., Any], keys: Mapping[str, Any]) -> Any:
-    """Call with the keys; a key too many or missing becomes a sentence."""
+    """Call with the keys, those of a built-in one with numbers in SI; a key too many or missing becomes a sentence."""
     signature = inspect.signature(maker)
     try:
         signature.bind(**keys)
     except TypeError as error:
         takes = ", ".join(signature.parameters) or "no keys"
-        raise InputError(f"mechanism '{spec}': {error}; it takes {takes}") from None
-    return maker(**keys)
+        lacking = [
+            p.name
+            for p in signature.parameters.values()
+            if p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD and p.name not in keys
+        ]
+        example = _EXAMPLES.get(spec) or ", ".join(f"{name}: …" for name in lacking)
+        advice = f"needs {' and '.join(lacking)}; write e.g. mechanism_keys: {{{example}}} into the config"
+        raise InputError(f"mechanism '{spec}': {advice if lacking else error}; it takes {takes}") from None
+    numbers = {name: p.default for name, p in signature.parameters.items()} if spec in REGISTRY else {}
+    return maker(
+        **{
+            name: amount(str(value), _UNITS.get(name, "m"), f"mechanism '{spec}': {name}")
+            if isinstance(numbers.get(name), float) and not isinstance(value, int | float)
+            else value
+            for name, value in keys.items()
+        }
+    )

@@ -253,8 +253,12 @@ def read_pose(
         named.format(c) in table for c in (*_QUATERNION, *(c for columns, _ in EULER_ANGLES.values() for c in columns))
     )
     if not mechanism.orientations and not turns_freely:
-        pose = _measured(table, mechanism.pose, mechanism) if partial else mechanism.pose
-        pose = tuple(pose or mechanism.pose)
+        flat = getattr(mechanism, "flat", False) and named.format("z") not in table
+        of = tuple(mechanism.pose)[: 2 if flat else None]
+        pose = (tuple(_measured(table, of, mechanism)) if partial else of) or of
+        if flat and pose == of:
+            both = np.pad(stacked(of, _POSE_LIMIT), ((0, 0), (0, 1)))
+            return both, tuple(mechanism.pose), None, tuple(named.format(c.name) for c in of)
         return _together(stacked(pose, _POSE_LIMIT), pose), pose, None, tuple(named.format(c.name) for c in pose)
     position = tuple(c for c in mechanism.pose if c.name not in ROTATION_VECTOR)
     turns = tuple(Coordinate(name, "rad") for name in ROTATION_VECTOR)

@@ -111,6 +111,8 @@ def _check_alike(first: Table, other: Table) -> None:
 # A joint is beyond its limits by more than rounding [rad or m]; in more than this share of the rows that is said, as
 # are directions of 0.
 _AT_LIMIT, _MANY = 1e-6, 0.1
+# A slide that moves less than this share of its travel may have limits in another unit.
+_USED = 0.02
 # The tool of an arm whose frames are unknown may lengthen its reach by this share.
 _TOOL_ALLOWANCE = 0.25
 
@@ -300,9 +302,15 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
             return
         outside = np.flatnonzero((records.whole & ~reachable(records.pose)).numpy())
         if len(outside):
+            other = "; if poses are measured in another frame than the machine's own, write " + (
+                "base_frame: unknown into its file"
+                if hasattr(mechanism, "convention")
+                else "mechanism: framed, and the mechanism and its keys as mechanism_keys: {mechanism: …, keys: {…}}"
+            )
             raise InputError(
                 f"{records.path}: the pose at {records.name_rows(outside)} is outside the workspace of "
                 f"{mechanism.name}; correct or remove {'it' if len(outside) == 1 else 'them'}, or check the units"
+                f"{other if len(outside) > _MANY * len(records) else ''}"
             )
         return
     reach = getattr(mechanism, "reach", None)
@@ -356,20 +364,27 @@ def _refuse_without_given(
 
 
 def _beyond_limits(mechanism: Moving, joints: NDArray[np.float64]) -> str:
-    """A sentence where many rows are beyond the limits of a joint that the machine's file names; else empty."""
+    """Where many rows are beyond the limits of a joint that the machine's file names, or use hardly any of a slide's
+    travel between them; else empty."""
     limits = getattr(mechanism, "limits", None)
     if limits is None or not getattr(mechanism, "recipe", {}).get("keys", {}).get("limits"):
         return ""
     low, high = limits.numpy().T
     beyond = ((joints < low - _AT_LIMIT) | (joints > high + _AT_LIMIT)).sum(0)
     most = _MANY * len(joints)
-    said = [f"{joint.name} in {n}" for joint, n in zip(mechanism.joints, beyond, strict=True) if n > most]
-    if not said:
-        return ""
-    return (
-        f"joints are beyond the limits of the machine's file (key limits), {', '.join(said)} of {len(joints)} rows: no "
-        "command will go there, so correct the limits if the machine does"
-    )
+    said, names = [], [joint.name for joint in mechanism.joints]
+    if far := [f"{name} in {n}" for name, n in zip(names, beyond, strict=True) if n > most]:
+        said.append(
+            f"joints are beyond the limits of the machine's file (key limits), {', '.join(far)} of {len(joints)} rows: "
+            "no command will go there, so correct the limits if the machine does"
+        )
+    used, travel = np.ptp(joints, axis=0), high - low
+    hardly = (used > 0) & (used < _USED * travel) & (travel < np.inf) & [c.unit == "m" for c in mechanism.joints]
+    if few := [f"{names[i]} {used[i]:.3g} m of {travel[i]:.3g} m" for i in np.flatnonzero(hardly)]:
+        said.append(
+            f"rows use hardly any of the travel in the machine's file, {', '.join(few)}: check the unit of its limits"
+        )
+    return "; ".join(said)
 
 
 def _half_signs(table: Table, chosen: Sequence[Coordinate]) -> str:

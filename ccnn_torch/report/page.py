@@ -118,8 +118,11 @@ class Page:
     best: str | None = None
     worse: bool = False
 
-    def show(self, console: Console, details: bool = True) -> None:
-        """Print the tables and notes if there are to be `details`, then what matters: verdict, answers and cautions."""
+    def show(self, console: Console, details: bool = True, where: str = "the report") -> None:
+        """Print the tables and notes if there are to be `details`, then what matters: verdict, answers and cautions.
+
+        where: tables and notes are else.
+        """
         if details:
             for section in self.sections:
                 replace(section, answers=()).show(console)
@@ -133,7 +136,7 @@ class Page:
             print_text(sentence, console, "yellow")
         if not details:
             rest = f"Tables and {count_text(len(self.notes), 'note')}" if self.notes else "Tables"
-            print_text(f"{rest} are in the report; --details shows them here.", console, "dim")
+            print_text(f"{rest} are in {where}; --details shows them here.", console, "dim")
 
     def markdown(self) -> str:
         """Title, verdict, cautions, sections and notes."""

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from ccnn_torch.calibration.physics import frames_of_repeats
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
 from ccnn_torch.diagnosis.from_records import named_machine, situation_of
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
@@ -25,6 +26,7 @@ from ccnn_torch.identification.judge import scatter
 from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames, load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import load_records
+from ccnn_torch.records.splits import Split
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 NOISE = 5e-5
@@ -236,8 +238,10 @@ def test_the_wrong_tool_is_named_with_the_right_one() -> None:
     records = load_records(DATA / "ur10_b_500.csv", load_mechanism(str(DATA / "ur10.yaml")), learns=False)
     here = replace(records, orientation="none", pose_coordinates=records.pose_coordinates[:3])
     wrong = replace(here, joints=joints, pose=arm.forward_kinematics(joints, truth))
-    with pytest.raises(InputError, match=r"seems to be at 20.0, -?0.0, 50.0 mm from the flange and not at 0.0, 0.0"):
-        situation_of(wrong, arm)
+    split = Split(torch.arange(60), torch.arange(0), torch.arange(0))
+    for told in (lambda: situation_of(wrong, arm), lambda: frames_of_repeats(arm, wrong, [split, split])):
+        with pytest.raises(InputError, match=r"with base frame fitted.* at 20.0, -?0.0, 50.0 mm .* not at 0.0, 0.0"):
+            told()
 
 
 def _as_fixed_angles(pose: Tensor) -> Tensor:

@@ -281,7 +281,10 @@ def test_rows_that_cannot_be_are_named(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     table = {"q1[rad]": joints[:, 0], "q2[rad]": joints[:, 1], "x[m]": pose[:, 0], "y[m]": pose[:, 1]}
     write_table(path, {k: v.numpy() for k, v in table.items()})
-    with pytest.raises(InputError, match=r"rows\.csv: the pose at line 9 \(row 8\) is outside the workspace"):
+    with pytest.raises(InputError, match=r"rows\.csv: the pose at line 9 \(row 8\) is outside the .* check the units$"):
+        ccnn_torch.identify(mechanism="five_bar", records=str(path))
+    write_table(path, {k: v.numpy() + 5 * (k == "x[m]") for k, v in table.items()})
+    with pytest.raises(InputError, match=r"another frame .*, write mechanism: framed, and .*: {mechanism: "):
         ccnn_torch.identify(mechanism="five_bar", records=str(path))
 
 

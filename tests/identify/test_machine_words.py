@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -196,6 +197,11 @@ def test_rows_beyond_the_limits_of_the_file_say_so(tmp_path: Path) -> None:
     write_table(tmp_path / "r.csv", columns)
     found = load_records(str(tmp_path / "r.csv"), load_mechanism(str(tmp_path / "gantry.yaml")))
     assert "beyond the limits of the machine's file (key limits), q3 in 30 of 30 rows" in found.doubt
+    assert "hardly any" not in found.doubt
+    wide = re.sub("limits: {[^}]*", "limits: {q3: [-190 m, 10 m]", template("gantry"))
+    (tmp_path / "gantry.yaml").write_text(wide)
+    found = load_records(str(tmp_path / "r.csv"), load_mechanism(str(tmp_path / "gantry.yaml")))
+    assert "file, q3 0.27 m of 200 m: check the unit of its limits" in re.sub(r"0\.2\d+", "0.27", found.doubt)
 
 
 def _printer(folder: Path) -> Path:
@@ -281,6 +287,7 @@ def test_the_screen_has_the_terms_of_the_telescope_that_is_shipped(tmp_path: Pat
     words = (f"records={data / 'telescope.csv'}", f"mechanism={data / 'telescope.yaml'}", "save_report=false")
     code, screen, said = cli("identify", *words, "--out", tmp_path / "found")
     assert code == 0 and "all 6 values are determined" in screen, said
+    assert "are in identified.json; --details shows them here." in " ".join(screen.split())
     lines = dict(line.strip().rsplit(": ", 1) for line in screen.splitlines() if " ± " in line)
     truth = {"IA": 412.0, "IE": -85.0, "CA": 34.0, "NPAE": -27.0, "AN": 61.0, "AW": -48.0}
     assert {name.split(" ")[-1] for name in lines} == set(truth) and "┃" not in screen

@@ -9,8 +9,18 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import FiveBar, Framed, SerialArm, Stewart, load_mechanism, mechanism_from_description
+from ccnn_torch.mechanisms import (
+    FiveBar,
+    Framed,
+    SerialArm,
+    Stewart,
+    as_measured,
+    load_mechanism,
+    mechanism_from_description,
+)
 from ccnn_torch.numerics.least_squares import jacobian_of
+from ccnn_torch.records import load_records, read_table, write_table
+from ccnn_torch.records.headers import read_pose
 
 BASE = [0.3, -0.2, 0.5, 0.4, -0.3, 1.0]
 TOOL = [0.02, 0.01, 0.03, 0.1, 0.2, -0.1]
@@ -36,6 +46,18 @@ def _matrices(frame):
     matrices = np.tile(np.eye(4), (len(frame[0]), 1, 1))
     matrices[:, :3, 3], matrices[:, :3, :3] = frame[0].numpy(), frame[1].numpy()
     return matrices
+
+
+def test_a_machine_that_moves_in_a_plane_needs_no_z(tmp_path):
+    framed = _framed(FiveBar(), tool=False)
+    joints = framed.sample_joints(20, torch.Generator().manual_seed(0)).T.numpy()
+    table = dict(zip(("q1[rad]", "q2[rad]", "x[mm]", "y[mm]"), (*joints, joints[0], joints[1]), strict=True))
+    write_table(tmp_path / "flat.csv", table)
+    write_table(tmp_path / "zeros.csv", table | {"z[mm]": np.zeros(20)})
+    flat, zeros = (load_records(tmp_path / f"{name}.csv", framed) for name in ("flat", "zeros"))
+    assert torch.equal(flat.pose, zeros.pose) and flat.pose_coordinates == zeros.pose_coordinates == framed.pose
+    assert as_measured(framed, flat.pose_coordinates) is framed
+    assert np.array_equal(read_pose(read_table(tmp_path / "flat.csv"), framed)[0], zeros.pose.numpy())
 
 
 @pytest.mark.parametrize("name", ["stewart", "overconstrained_2dof", "tripod", "machine_tool"])

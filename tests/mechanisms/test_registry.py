@@ -1,6 +1,8 @@
 """Mechanisms by name, by file and from a description."""
 
 import json
+import math
+import re
 
 import pytest
 import torch
@@ -8,6 +10,7 @@ from catalogue import FIVE_BAR, NAMES, UR10, make
 from five_bar import FiveBar
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms import Tripod, load_mechanism, mechanism_from_description
 
 
@@ -19,6 +22,30 @@ def test_by_name_with_keys():
         load_mechanism("xyz")
     with pytest.raises(InputError, match="'radius'; it takes L, r"):
         load_mechanism("tripod", radius=3)
+
+
+def test_keys_with_units():
+    bar = load_mechanism("five_bar", l="220 mm", L="0.28", a=0.08)
+    assert bar.nominal[:3].tolist() == [0.22, 0.28, -0.08]
+    assert torch.equal(mechanism_from_description(bar.describe()).nominal, bar.nominal)
+    assert load_mechanism("delta_linear", lean="2 deg").nominal[2] == math.radians(2)
+    for value in ("long", [0.2], None):
+        with pytest.raises(InputError, match=r"mechanism 'five_bar': l: '.*' is no number with a unit"):
+            load_mechanism("framed", mechanism="five_bar", keys={"l": value})
+    with pytest.raises(InputError, match="mechanism 'five_bar': l is in 'deg', an angle, but must be a length"):
+        load_mechanism("five_bar", l="220 deg")
+
+
+@pytest.mark.parametrize("name", ["framed", "partial", "instrument", "pair", "machine"])
+def test_a_mechanism_around_another_says_what_to_write(name, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match=f"'{name}': needs .*; write e.g. mechanism_keys: {{.*}} into the") as refused:
+        load_mechanism(name)
+    monkeypatch.chdir(tmp_path)
+    for file in ("my_arm", "left", "right"):
+        (tmp_path / f"{file}.yaml").write_text(re.sub(r"unknown[^\n]*", "identity", UR10))
+    said = str(refused.value)
+    keys = parse_yaml(said[said.index("{") : said.rindex("}") + 1], "said")
+    assert len(load_mechanism(name, **keys).geometry) > 9
 
 
 def test_users_file(tmp_path):

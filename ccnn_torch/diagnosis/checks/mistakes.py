@@ -348,7 +348,7 @@ def frame_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
         told = json.dumps({key: value for key, value in inside.items() if value}, ensure_ascii=False)
         key = f"mechanism=framed 'mechanism_keys={told}'"
         missing = [c.name for c in framed.pose if c.name not in {own.name for own in mechanism.pose}]
-        key += f", and give the pose as {', '.join(c.name for c in framed.pose)}" if missing else ""
+        key += f", and give the pose as {', '.join(c.name for c in framed.pose)}" if missing and not framed.flat else ""
     left = torch.linalg.vector_norm(there - seen[0], dim=-1).nan_to_num(nan=torch.inf) / size.place
     if float(left.median()) > _LEFT * USUAL:
         return ""
@@ -375,7 +375,8 @@ def tool_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
     there, own = (", ".join(f"{1e3 * float(v):.1f}" for v in tool) for tool in (values[-6:-3], arm.nominal[-6:-3]))
     return (
         f"the measured point seems to be at {there} mm from the flange and not at {own} mm, which leaves "
-        f"{1e3 * left:.3g} mm; correct tool_offset in its file, or write tool_offset: unknown to have it fitted"
+        f"{1e3 * left:.3g} mm; correct tool_offset in its file, or write tool_offset: unknown (in place of "
+        "tool_frame, where that is there) to have it fitted"
     )
 
 

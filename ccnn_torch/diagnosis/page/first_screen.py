@@ -18,6 +18,7 @@ from ccnn_torch.diagnosis.verdict.findings import (
 )
 from ccnn_torch.diagnosis.verdict.text import (
     LEAST,
+    both_sides,
     capital,
     follows_words,
     in_doubt,
@@ -179,10 +180,14 @@ def _measure(results: Block, about: About) -> str:
         motion = wanted[0].get("motion")
         what = f"{len(wanted)} poses" if motion is None else f"{motion['joint']}: {motion['text']},"
         said.append(f"{what} {aim}: {path}.")
-    missing = results.get("missing_covariates")
-    if missing:
-        each = [f"{columns_text(entry['columns'])} (would show {listed(list(entry['effects']))})" for entry in missing]
-        said.append(f"Record as well: {listed(each)}.")
+    for still, what in ((False, "Record as well"), (True, "Recorded, but never changing")):
+        each = [
+            f"{columns_text(entry['columns'])} (would show {listed(list(entry['effects']))})"
+            for entry in results.get("missing_covariates", ())
+            if entry.get("constant", False) == still
+        ]
+        text = listed(each)
+        said += [f"{what}: {text}{both_sides(text) if still else ''}."] if each else []
     return " ".join(said)
 
 

@@ -177,7 +177,7 @@ def unseen_table(results: Block) -> Table | None:
 
 def record_table(results: Block) -> Table | None:
     """Which columns to add to the records, most promising first."""
-    missing = results.get("missing_covariates")
+    missing = [entry for entry in results.get("missing_covariates", ()) if not entry.get("constant")]
     if not missing:
         return None
     typical = max(size for entry in missing for size in entry["effects"].values())

@@ -177,6 +177,11 @@ def unseen_text(name: str, why: str) -> str:
     return f"{name} cannot be seen without {why}"
 
 
+def both_sides(columns: str) -> str:
+    """The end of a sentence on columns that never change: what to do where they are directions; else empty."""
+    return ": approach the joints from both sides" if "direction" in columns else ""
+
+
 def lacking_text(name: str, condition: Condition) -> str:
     """That a simulator takes what the records do not have, without a full stop."""
     usual = f"{condition.usual:g} {condition.unit}"

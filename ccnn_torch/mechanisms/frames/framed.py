@@ -47,6 +47,11 @@ class Framed(Around):
             return ()
         return ("base",) * self.base + ("tool",) * self.tool
 
+    @property
+    def flat(self) -> bool:
+        """Whether the mechanism moves in a plane, so that a measured z would be 0 and need not be given."""
+        return [c.name for c in self.mechanism.pose] == ["x", "y"]
+
     def __init__(
         self,
         mechanism: Mechanism,

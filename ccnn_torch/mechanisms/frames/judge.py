@@ -78,18 +78,17 @@ def judge_frames(
             f"{share:.0%} of the measured poses by far more than the others, up to {1e3 * float(length.max()):.3g} mm"
         )
     if wrong:
+        fitted = f"with {' and '.join(arm.unknown_frames)} frame fitted"
         counted = coupled_count(arm, joints, pose)
         if counted is not None:
             raise InputError(
-                f"{where}: with base and tool frame fitted, {arm.name} misses {wrong}, and fits with the third joint "
-                f"counted as {counted}, as on controllers that count it from the horizontal; write "
-                f'joint_map: {{q3: "{counted}"}}'
+                f"{where}: {fitted}, {arm.name} misses {wrong}, and fits with the third joint counted as {counted}, "
+                f'as on controllers that count it from the horizontal; write joint_map: {{q3: "{counted}"}}'
             )
         raise InputError(
-            f"{where}: with base and tool frame fitted, {arm.name} still misses {wrong}, so this model does not "
-            "describe these rows; check the units, the order, signs and zeros of the joints, the convention (standard "
-            "or modified), and whether this is the robot that was measured; ccnn check names "
-            "a single mistake among these"
+            f"{where}: {fitted}, {arm.name} still misses {wrong}, so this model does not describe these rows; "
+            "check the units, the order, signs and zeros of the joints, the convention (standard or modified), and "
+            "whether this is the robot that was measured; ccnn check names a single mistake among these"
         )
     rows = torch.nonzero(far.reshape(-1, len(joints)).any(0)).squeeze(-1).tolist()
     if not rows:

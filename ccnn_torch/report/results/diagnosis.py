@@ -195,6 +195,8 @@ class MissingColumns(Result):
     columns: list[str]
     effects: dict[str, float]
     unit: Length
+    constant: bool = False
+    """whether they were recorded, and never change"""
 
 
 class Covariate(Result):
