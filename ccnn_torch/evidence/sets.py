@@ -31,6 +31,8 @@ _RIVAL, _THERE = 30.0, 10.0
 _NEAR = 50_000
 # Sets are evaluated in one batch where their widths differ by less than this.
 _ALIKE = 24
+# Share of the squares of an atom's largest column below which what is left of one is rounding.
+_ROUNDING = 1e-12
 # Beside a set that so many atoms are added to, all columns are evaluated once.
 _FEW = 5
 
@@ -213,10 +215,11 @@ def added_scale(dictionary: Dictionary, before: Sequence[FittedSet], more: Seque
         else:
             place = torch.tensor(each)[:, None], own[rows]
             square[rows], along[rows], yy[rows] = squares[place], products[place], left[place[0][:, 0]]
+    # Directions in which the atom does nothing, or nothing that the set cannot do, are rounding.
+    there = square > _ROUNDING * turned.xx.diagonal()[own].amax(-1, keepdim=True)
+    square, along = square.where(there, 0.0), along.where(there, 0.0)
     prior = Prior(turned.values, dictionary.noise_dof)
-    return fit_in_axes(
-        square.clamp_min(0), along, dictionary.widths[atoms[:, 0]] > 0, yy.clamp_min(0), prior
-    ).log_scale[:, 0]
+    return fit_in_axes(square, along, dictionary.widths[atoms[:, 0]] > 0, yy.clamp_min(0), prior).log_scale[:, 0]
 
 
 def _batches(

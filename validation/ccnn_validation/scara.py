@@ -6,8 +6,9 @@ other lengths, axes that are not parallel, zeros, harmonic drives of ratio 80 an
 the motor, eccentric encoders, a quill on a ball screw spline (error of its lead that grows, bends and returns with each
 turn, a nut that runs out, a twisted spline), play, arms and bearings that bend under weight and payload, arms that
 grow, zeros that drift. Ours (`ccnn run`, by the written file) has a Denavit-Hartenberg table, or the machine file of a
-SCARA ("own words"), both with the gears' ratios and the screw's lead, as the plain SciPy script knows them; another
-one does not know the ratios. Judged in the frame and at the tool point that suit best; "a reading" is what a reading of the tracker is off.
+SCARA ("own words"), both with the gears' ratios and the screw's lead, as the plain SciPy script knows them; another one
+does not know the ratios. Judged in the frame and at the tool point that suit best; "a reading" is what a reading of the
+tracker is off.
 """
 
 from __future__ import annotations
