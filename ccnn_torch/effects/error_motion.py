@@ -37,7 +37,7 @@ _DEGREES = 16
 
 
 def _slide(degree: int) -> _Form:
-    """As large as of a path whose slope is random."""
+    """As large as of a path between two ends whose slope is random: the integral of P_(k-1) is f_k / (2k - 1)."""
     part = "waves" if 4 < degree <= _DEGREES // 2 else "short waves" if degree > 4 else ""
     return _Form(str(degree), 1 / math.sqrt(2 * degree - 1), degree > 2, part)
 
@@ -65,9 +65,10 @@ _SIZE = {"m": 1e-5, "rad": 2e-5}
 class ErrorMotion(Effect):
     """Δx = Σ f_k(q) (t_k + ω_k × (x - o)), ΔR = Σ f_k(q) ω_k: error motions of axes (ISO 230-1:2012, 3.4; ISO 230-7).
 
-    Of a sliding joint f_k is Legendre's polynomial of degree k = 1 to 16 of its place in its travel, -1 to 1; of one
-    that turns sin q, cos q, sin 2q and cos 2q: once a turn, as a bearing that runs out or an axis that wobbles, and
-    twice. o is the origin of the frame that the joint carries, and t and ω are along and about that frame's axes.
+    Of a sliding joint f_1 is its place in its travel, -1 to 1, and f_k = P_k - P_(k-2) of Legendre's polynomials of it,
+    up to k = 16: their integrals, 0 at both ends as straightness is told. Of one that turns sin q, cos q, sin 2q and
+    cos 2q: once a turn, as a bearing that runs out or an axis that wobbles, and twice. o is the origin of the frame
+    that the joint carries, and t and ω are along and about that frame's axes.
     The travel is that of the machine's file, or where its rows have been, which are shapes of one value. Shifts in
     proportion to the travel are leads and squarenesses and no error motion; turns about a joint's own axis
     are an error of its drive. Degrees above 2, and twice a turn, are secondary.

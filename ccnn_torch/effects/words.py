@@ -38,8 +38,8 @@ _WORDS = {
         "guides or bearings that do not run true",
         "error motion of the axis",
         "Shift along x, y, z and turn about x, y, z of what the joint carries: of a sliding joint by Legendre's "
-        "polynomial of that degree from one end of its travel (-1) to the other (1), of a turning one by the sine or "
-        "cosine of its angle, or of twice that.",
+        "polynomial of that degree less the one two degrees lower, from one end of its travel (-1) to the other (1), "
+        "of a turning one by the sine or cosine of its angle, or of twice that.",
         "Guides and bearings of {where}: their alignment, their bed, and the load on them.",
     ),
     "joint_offset": Words(

@@ -422,14 +422,15 @@ def test_a_guide_shifts_and_turns_all_that_it_carries_about_where_its_carriage_i
     joints = torch.tensor([[0.25, 0.6, 0.1]], dtype=torch.float64)
     found = columns(make_effect("error_motion"), Situation(machine, joints, {}, default_gravity(machine)), NO_SHAPE)
     assert len(found) == 3 * (16 * 6 - 3) and "q1 x 1" not in found
-    # Of x at a quarter of a metre u = -0.5: P1 = -0.5, P2 = -0.125, P3 = 0.4375.
-    assert torch.allclose(found["q1 y 2"][0, :3], -0.125 * torch.eye(3).double()[1])
+    # Of x at a quarter of a metre u = -0.5: P0 = 1, P1 = -0.5, P2 = -0.125, P3 = 0.4375.
+    assert torch.allclose(found["q1 y 2"][0, :3], -1.125 * torch.eye(3).double()[1])
     lever = torch.tensor([0.0, 0.6, 0.1], dtype=torch.float64)
-    for name, form in (("q1 rx 1", -0.5), ("q1 rx 3", 0.4375)):
+    for name, form in (("q1 rx 1", -0.5), ("q1 rx 3", 0.9375)):
         turned = torch.linalg.cross(torch.eye(3).double()[0], lever)
         assert torch.allclose(found[name][0, :3], form * turned)
     legendre = np.polynomial.legendre.legvander(-0.5, 16).flatten()
-    assert all(abs(float(found[f"q1 y {k}"][0, 1]) - legendre[k]) < 1e-14 for k in range(2, 17))
+    for k in range(2, 17):
+        assert float(found[f"q1 y {k}"][0, 1]) == pytest.approx(legendre[k] - legendre[k - 2], abs=1e-14)
     # z carries the tool alone, which is at its carriage.
     assert not found["q3 rx 1"][:, :3].any()
 
@@ -442,8 +443,8 @@ def test_a_track_without_limits_is_described_over_where_its_rows_have_been() -> 
     shapes = effect.shapes(rows)
     assert [(s.name, s.unit, s.grid) for s in shapes] == [("q1 from", "m", (0.0,)), ("q1 to", "m", (4.0,))]
     ends = torch.tensor([s.grid[0] for s in shapes], dtype=torch.float64)
-    # P2 of u = -1, -0.25, 0, 1.
-    wanted = torch.tensor([1, -0.40625, -0.5, 1], dtype=torch.float64)
+    # P2 - 1 of u = -1, -0.25, 0, 1.
+    wanted = torch.tensor([0, -1.40625, -1.5, 0], dtype=torch.float64)
     shift = columns(effect, rows, ends)["q1 x 2"]
     assert torch.allclose(shift[:, :3].norm(dim=-1), wanted.abs())
     many = torch.stack([ends, torch.tensor([1.0, 3.0]).double()])

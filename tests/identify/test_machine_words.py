@@ -139,7 +139,7 @@ def test_bent_and_twisted_guides_are_told_and_commanded_away(tmp_path: Path, cli
     assert code == 0, told
     said = json.loads((tmp_path / "why" / "diagnosis.json").read_text())
     assert said["verdict"]["effects"] == ["error_motion"]
-    assert "Error motion of the axis of joint 1: y 2 -19.9 µm" in (tmp_path / "why" / "diagnosis.md").read_text()
+    assert "Error motion of the axis of joint 1: y 2 -19.8 µm" in (tmp_path / "why" / "diagnosis.md").read_text()
     fresh = rng.uniform(0.01, [0.99, 0.79, 0.29], (80, 3))
     write_table(tmp_path / "t.csv", {f"q{k + 1}[m]": fresh[:, k] for k in range(3)})
     code, _, told = cli("compensate", tmp_path / "why" / "diagnosis.json", tmp_path / "t.csv", tmp_path / "c.csv")
