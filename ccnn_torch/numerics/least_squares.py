@@ -14,6 +14,8 @@ from ccnn_torch.numerics.trees import chosen, picked
 
 _EPS = torch.finfo(torch.float64).eps
 _DAMPING_FLOOR, _DAMPING_CEILING = 1e-15, 1e15
+# Numbers in the copies of a point below which one backward pass through all of them beats a pass for each output.
+_SMALL = 20_000
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,10 @@ class Solution:
 
 
 def jacobian_of(
-    function: Callable[[Tensor], Tensor], point: Tensor, combined: Callable[[Tensor], Tensor] | None = None
+    function: Callable[[Tensor], Tensor],
+    point: Tensor,
+    combined: Callable[[Tensor], Tensor] | None = None,
+    copies: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """Value and Jacobian of a function that treats its leading dims independently.
 
@@ -48,10 +53,19 @@ def jacobian_of(
         function: `... x k` -> `... x c`.
         point: `... x k`.
         combined: of the value, which combinations of the outputs are asked for, `... x r x c`; None = each output.
+        copies: `c` where the function takes more leading dims. Few small rows then go through one backward pass, in a
+            copy for each output: there the time goes with the number of operations.
 
     Returns:
         value `... x c` and Jacobian `... x c x k`, or that of the combinations, `... x r x k`.
     """
+    if copies > 1 and copies * point.numel() <= _SMALL:
+        each = point.detach().expand(copies, *point.shape).clone().requires_grad_()
+        with torch.enable_grad():
+            value = function(each)
+            total = value.diagonal(dim1=0, dim2=-1).sum()
+            slope = torch.autograd.grad(total, each, materialize_grads=True)[0]
+        return value[0].detach(), slope.movedim(0, -2)
     with torch.enable_grad():
         point = point.detach().requires_grad_()
         value = function(point)
