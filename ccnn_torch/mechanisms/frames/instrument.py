@@ -268,7 +268,7 @@ class Instrument(Seen):
         def read(twist: Tensor) -> Frame:
             return self.frame(self._read(places, values, given, twist))
 
-        return frame_jacobian(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype))
+        return frame_jacobian(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype), len(self.channels))
 
     def _shown(self, joints: Tensor, rows: Tensor) -> list[tuple[Part, Tensor, Tensor, Tensor]]:
         """Each instrument with the joints `t x n` at which it read, and what it read and was pointed at there,
