@@ -407,6 +407,12 @@ def fit_single_groups(groups: Sequence[GroupProducts], yy: Tensor, prior: Prior)
     return fit_in_axes(axes.square, along, there, yy, prior), axes.each()
 
 
+def real_squares(square: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+    """Squares and products along principal axes, `b x M`, 0 where that is rounding."""
+    real = square > _DIGITS * square.amax(-1, keepdim=True)
+    return torch.where(real, square, 0.0), torch.where(real, along, 0.0)
+
+
 class Axes(NamedTuple):
     """Principal axes of `b` groups of columns.
 
@@ -443,6 +449,6 @@ def axes_of(products: Sequence[Tensor], like: Tensor) -> Axes:
     for width in sorted(set(widths) - {0}):
         mine = [k for k, w in enumerate(widths) if w == width]
         values, vectors = torch.linalg.eigh(torch.stack([products[k] for k in mine]))
-        square[mine, :width] = torch.where(values > _DIGITS * values[:, -1:], values, 0.0)
+        square[mine, :width] = real_squares(values, values)[0]
         alike.append((mine, vectors))
     return Axes(square, alike)
