@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate, chain
 from typing import NamedTuple, Protocol
 
 import torch
@@ -18,9 +19,12 @@ from ccnn_torch.evidence.marginal_likelihood import (
     Grams,
     GroupProducts,
     Prior,
+    column_indices,
+    fit_in_axes,
     fit_single_groups,
     groups_of,
     own_products,
+    real_squares,
     scaled,
 )
 from ccnn_torch.evidence.priors import crowd
@@ -154,17 +158,9 @@ def singles_of(
     """
     values = float(y.numel()) if values is None else values
     products = [own_products(columns, y) for columns in x]
-    found, axes = _alone(dict(enumerate(products)), atoms, y.square().sum(), values, noise_dof)
-    return Singles(found, [*axes.values()], products, values)
-
-
-def _alone(
-    products: Mapping[int, GroupProducts], atoms: Sequence[Candidate], yy: Tensor, values: float, noise_dof: float
-) -> tuple[dict[tuple[int, ...], FittedSet], dict[int, Tensor]]:
-    """No atom, and each alone of those whose products are given; the principal axes of each."""
-    fits, axes = fit_single_groups([NO_COLUMNS, *products.values()], yy, Prior(values, noise_dof))
-    sets, own = [(), *((i,) for i in products)], dict(zip(products, axes[1:], strict=True))
-    return fitted_sets(sets, sets, fits, own, atoms), own
+    fits, axes = fit_single_groups([NO_COLUMNS, *products], y.square().sum(), Prior(values, noise_dof))
+    sets = [(), *((i,) for i in range(len(products)))]
+    return Singles(fitted_sets(sets, sets, fits, dict(enumerate(axes[1:])), atoms), axes[1:], products, values)
 
 
 def fitted_sets(
@@ -186,10 +182,11 @@ def fitted_sets(
     evidence = torch.where(torch.isfinite(fits.log_evidence), fits.log_evidence, -torch.inf)
     tables = (evidence, fits.log_scale, fits.energy, fits.rss, fits.noise, fits.effective)
     rows = zip(sets, ordered, fits.first, fits.mean, *(v.tolist() for v in tables), strict=True)
-    found = {}
+    found, wide = {}, {i: len(axes[i]) for i in {*chain(*ordered)}}
     for own, order, first, rest, log_evidence, log_scale, energy, rss, noise, effective in rows:
-        widths = [len(axes[i]) for i in order]
-        along = [*(first[:w] for w in widths[:1]), *torch.split(rest[: sum(widths[1:])], widths[1:])]
+        widths = [wide[i] for i in order]
+        others = zip(widths[1:], accumulate(widths[1:]), strict=True)
+        along = [*(first[:w] for w in widths[:1]), *(rest[end - w : end] for w, end in others)]
         place = [order.index(i) for i in own]
         found[own] = FittedSet(
             members=own,
@@ -213,18 +210,22 @@ def with_noise(dictionary: Dictionary, variance: float) -> Dictionary:
         dictionary: candidates.
         variance: of the noise, in units of the noise so far.
     """
-    grams, size = scaled(dictionary.grams, variance), math.sqrt(variance)
-    known = CERTAIN * grams.values
-    products = {i: GroupProducts(grams.xx[_run(g), _run(g)], grams.xy[_run(g)]) for i, g in dictionary.groups.items()}
-    alone, axes = _alone(products, dictionary.atoms, grams.yy, grams.values, known)
+    grams, turned = scaled(dictionary.grams, variance), scaled(dictionary.turned, variance)
+    size, known = math.sqrt(variance), CERTAIN * grams.values
+    sets = [(), *((i,) for i in dictionary.groups)]
+    held = torch.tensor([*dictionary.groups], dtype=torch.int64)[:, None]
+    index, _ = column_indices(dictionary.begins[held], dictionary.widths[held])
+    # The last column is of zeros.
+    index = torch.nn.functional.pad(index, (0, 1, 1, 0), value=-1)
+    square, along = real_squares(turned.xx.diagonal()[index], turned.xy[index])
+    fits = fit_in_axes(square, along, torch.arange(len(sets)) > 0, grams.yy, Prior(grams.values, known))
     return replace(
         dictionary,
         y=dictionary.y / size,
         columns=dictionary.columns / size,
         grams=grams,
-        axes=axes,
-        turned=_turned(grams, dictionary.groups, axes),
-        alone=alone,
+        turned=turned,
+        alone=fitted_sets(sets, sets, fits, dictionary.axes, dictionary.atoms),
         noise_dof=known,
     )
 

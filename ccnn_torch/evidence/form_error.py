@@ -56,10 +56,11 @@ def with_form_error(dictionary: Dictionary, best: FittedSet, floor: float, is_kn
         floor: mean square of the noise, in units of the dictionary's.
         is_known: whether the noise was given or the records show it.
     """
-    levels = [_at_level(dictionary, best, floor, level) for level in LEVELS]
+    made: _Searched = {}
+    levels = [_at_level(dictionary, best, floor, level, made) for level in LEVELS]
     if not is_known:
         return levels
-    every, usual = _at_level(dictionary, best, floor, 0.0), levels[0]
+    every, usual = _at_level(dictionary, best, floor, 0.0, made), levels[0]
     exact = _without_discrepancies(every)
     count = dictionary.grams.values
     left, other = (_mean_square(one.found[0], one.dictionary) * one.variance / floor for one in (exact, usual))
@@ -111,11 +112,18 @@ def form_variance(shares: Sequence[float], energies: Sequence[float], most: floa
     return sum(share * min(energy, most) for share, energy in zip(shares, energies, strict=True))
 
 
-def _at_level(dictionary: Dictionary, best: FittedSet, floor: float, level: float) -> Posterior:
+# By variance: where nothing is found all levels are of one.
+_Searched = dict[float, tuple[Dictionary, list[FittedSet]]]
+
+
+def _at_level(dictionary: Dictionary, best: FittedSet, floor: float, level: float, made: _Searched) -> Posterior:
     noise = max(floor, _mean_square(best, dictionary))
     variance = max(noise + level * form_error_of(best, dictionary), math.ulp(1.0))
-    weighed = with_noise(dictionary, variance)
-    found = [replace(f, log_posterior=f.log_posterior - _lacking(weighed, f, level)) for f in probable_sets(weighed)]
+    if variance not in made:
+        made[variance] = (weighed := with_noise(dictionary, variance)), probable_sets(weighed)
+    weighed, found = made[variance]
+    if level:
+        found = [replace(f, log_posterior=f.log_posterior - _lacking(weighed, f, level)) for f in found]
     return Posterior(weighed, sorted(found, key=lambda f: -f.log_posterior), 1 / len(LEVELS), variance)
 
 

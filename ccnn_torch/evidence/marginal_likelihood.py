@@ -301,23 +301,28 @@ def _most_probable(
     edge, across_t = np.diagonal(own, axis1=-2, axis2=-1), across.swapaxes(-2, -1)
     groups, total = there.numpy(), np.broadcast_to(yy.numpy(), len(square))
     psi, noise = _to_begin_with(parts, groups, total, prior) if start is None else (v.numpy() for v in start)
+    # What stays so where there are no other columns.
+    scale_rest, u_rest, mean, factor, inverse, reached, spread = along_rest, along_rest, along_rest, own, own, 0.0, 0.0
     for k in range(updates + 1):
         half, sigma = np.exp(psi / 2), np.sqrt(noise)[:, None]
-        scale_first, scale_rest = half[:, :1], (member @ half[:, 1:, None])[..., 0]
-        first_in, rest_in = scale_first / sigma, scale_rest / sigma
+        scale_first = half[:, :1]
+        first_in = scale_first / sigma
         diagonal = 1 + square * first_in**2
-        # The first group's columns, weighted as they take part in what is left of the others.
-        weighted = across * (first_in**2 / diagonal)[..., None]
-        both = rest_in[:, :, None] * rest_in[:, None, :]
-        factor, inverse = _factor_and_inverse((own - across_t @ weighted) * both, edge * rest_in**2)
-        c_first, c_rest = scale_first * along_first / noise[:, None], scale_rest * along_rest / noise[:, None]
-        taken = (across_t @ (first_in / diagonal * c_first)[..., None])[..., 0]
-        u_rest = (inverse @ (c_rest - rest_in * taken)[..., None])[..., 0]
-        mean = scale_rest * u_rest
-        reached = (across @ mean[..., None])[..., 0]
+        c_first = scale_first * along_first / noise[:, None]
+        if along_rest.size:
+            scale_rest = (member @ half[:, 1:, None])[..., 0]
+            rest_in = scale_rest / sigma
+            # The first group's columns, weighted as they take part in what is left of the others.
+            weighted = across * (first_in**2 / diagonal)[..., None]
+            both = rest_in[:, :, None] * rest_in[:, None, :]
+            factor, inverse = _factor_and_inverse((own - across_t @ weighted) * both, edge * rest_in**2)
+            taken = (across_t @ (first_in / diagonal * c_first)[..., None])[..., 0]
+            u_rest = (inverse @ (scale_rest * along_rest / noise[:, None] - rest_in * taken)[..., None])[..., 0]
+            mean = scale_rest * u_rest
+            reached = (across @ mean[..., None])[..., 0]
+            spread = ((across_t @ (weighted / diagonal[..., None])) * both * inverse).sum((-2, -1))
         u_first = (c_first - first_in / sigma * reached) / diagonal
         first = scale_first * u_first
-        spread = ((across_t @ (weighted / diagonal[..., None])) * both * inverse).sum((-2, -1))
         gamma = parts.by_group(_total(1 - 1 / diagonal) - spread, 1 - np.diagonal(inverse, axis1=-2, axis2=-1))
         explained = _total(first * along_first) + _total(mean * along_rest)
         made = _total(first * (square * first + 2 * reached)) + _total((own @ mean[..., None])[..., 0] * mean)
@@ -402,6 +407,12 @@ def fit_single_groups(groups: Sequence[GroupProducts], yy: Tensor, prior: Prior)
     return fit_in_axes(axes.square, along, there, yy, prior), axes.each()
 
 
+def real_squares(square: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+    """Squares and products along principal axes, `b x M`, 0 where that is rounding."""
+    real = square > _DIGITS * square.amax(-1, keepdim=True)
+    return torch.where(real, square, 0.0), torch.where(real, along, 0.0)
+
+
 class Axes(NamedTuple):
     """Principal axes of `b` groups of columns.
 
@@ -438,6 +449,6 @@ def axes_of(products: Sequence[Tensor], like: Tensor) -> Axes:
     for width in sorted(set(widths) - {0}):
         mine = [k for k, w in enumerate(widths) if w == width]
         values, vectors = torch.linalg.eigh(torch.stack([products[k] for k in mine]))
-        square[mine, :width] = torch.where(values > _DIGITS * values[:, -1:], values, 0.0)
+        square[mine, :width] = real_squares(values, values)[0]
         alike.append((mine, vectors))
     return Axes(square, alike)

@@ -235,7 +235,7 @@ class Mechanism(nn.Module):
         """
         if type(self).frame is Mechanism.frame:
             return coordinates_jacobian(pose, self.pose, self.name)
-        return frame_jacobian(self.frame, pose)
+        return frame_jacobian(self.frame, pose, len(self.channels))
 
     def pose_near(self, position: Tensor, rotation: Tensor | None) -> Tensor:
         """A pose whose frame is close to a given one: where a search for the closest pose starts, `... x p` [SI].
@@ -312,7 +312,9 @@ class Mechanism(nn.Module):
         parameters = self.resolve(parameters)
         others = (parameters,) if guess is None else (parameters, guess)
         return frame_jacobian(
-            lambda q: self.frame(self.forward_kinematics(q, parameters, guess)), expand_leading(joints, *others)
+            lambda q: self.frame(self.forward_kinematics(q, parameters, guess)),
+            expand_leading(joints, *others),
+            len(self.channels),
         )
 
     def parameter_jacobian(
@@ -320,7 +322,9 @@ class Mechanism(nn.Module):
     ) -> Tensor:
         """The same by the parameters, at joints `... x n`; `... x 6 x k` or `... x 3 x k`, per parameter's unit."""
         values = self.resolve(parameters).expand(*joints.shape[:-1], -1)
-        return frame_jacobian(lambda theta: self.frame(self.forward_kinematics(joints, theta, guess)), values)
+        return frame_jacobian(
+            lambda theta: self.frame(self.forward_kinematics(joints, theta, guess)), values, len(self.channels)
+        )
 
     def jacobian_at(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """As `jacobian`, where the pose of the joints is known, `... x p` [SI]; NaN where that is.

@@ -89,12 +89,13 @@ def _angles(coordinates: tuple[Coordinate, ...], name: str) -> list[str]:
     return angles
 
 
-def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor:
+def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor, copies: int = 1) -> Tensor:
     """Jacobian of position and rotation vector (in the base frame) of a frame-valued function.
 
     Args:
         function: `... x n` -> position `... x 3`, rotation `... x 3 x 3` or None.
         point: `... x n`.
+        copies: as of `jacobian_of`, 6 or 3.
 
     Returns:
         `... x 6 x n`, or `... x 3 x n` without rotation; NaN where the frame is.
@@ -108,7 +109,7 @@ def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor
         turns = rotation is not None
         return position if rotation is None else torch.cat([position, rotation.flatten(-2)], dim=-1)
 
-    value, slope = jacobian_of(flat, point, lambda value: _twist(value, turns))
+    value, slope = jacobian_of(flat, point, lambda value: _twist(value, turns), copies)
     return torch.where(torch.isfinite(value).all(-1)[..., None, None], slope, torch.nan)
 
 

@@ -14,6 +14,8 @@ from ccnn_torch.numerics.trees import chosen, picked
 
 _EPS = torch.finfo(torch.float64).eps
 _DAMPING_FLOOR, _DAMPING_CEILING = 1e-15, 1e15
+# Numbers in the copies of a point below which one backward pass through all of them beats a pass for each output.
+_SMALL = 20_000
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,10 @@ class Solution:
 
 
 def jacobian_of(
-    function: Callable[[Tensor], Tensor], point: Tensor, combined: Callable[[Tensor], Tensor] | None = None
+    function: Callable[[Tensor], Tensor],
+    point: Tensor,
+    combined: Callable[[Tensor], Tensor] | None = None,
+    copies: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """Value and Jacobian of a function that treats its leading dims independently.
 
@@ -48,26 +53,33 @@ def jacobian_of(
         function: `... x k` -> `... x c`.
         point: `... x k`.
         combined: of the value, which combinations of the outputs are asked for, `... x r x c`; None = each output.
+        copies: `c` or `r`, where the function takes one more leading dim. Few small rows then go through one backward
+            pass, in a copy for each output: there the time goes with the number of operations.
 
     Returns:
         value `... x c` and Jacobian `... x c x k`, or that of the combinations, `... x r x k`.
     """
     with torch.enable_grad():
-        point = point.detach().requires_grad_()
+        lead = (copies,) if copies > 1 and copies * point.numel() <= _SMALL else ()
+        point = point.detach().expand(*lead, *point.shape).clone().requires_grad_()
         value = function(point)
         c, k = value.shape[-1], point.shape[-1]
+        first = value.expand(*point.shape[:-1], c)[0].detach() if lead else value.detach()
         outputs = torch.eye(c, dtype=value.dtype, device=value.device)
-        outputs = outputs if combined is None else combined(value.detach())
+        outputs = outputs if combined is None else combined(first)
+        if lead:
+            each = outputs.expand(*first.shape[:-1], -1, -1).movedim(-2, 0)
+            return first, _pulled(value, point, each).movedim(0, -2)
         if outputs.shape[-2] <= 2 * k:
             rows = [_pulled(value, point, e.expand_as(value)) for e in outputs.unbind(-2)]
-            return value.detach(), torch.stack(rows, dim=-2) if rows else value.new_zeros(*value.shape, k)
+            return first, torch.stack(rows, dim=-2) if rows else value.new_zeros(*value.shape, k)
         cotangent = torch.zeros_like(value, requires_grad=True)
         pulled = _pulled(value, point, cotangent, create_graph=True)
         columns = [
             _pulled(pulled, cotangent, e.expand_as(point)) for e in torch.eye(k, dtype=point.dtype, device=point.device)
         ]
         slope = torch.stack(columns, dim=-1)
-        return value.detach(), slope if combined is None else outputs @ slope
+        return first, slope if combined is None else outputs @ slope
 
 
 def _pulled(value: Tensor, point: Tensor, cotangent: Tensor, create_graph: bool = False) -> Tensor:

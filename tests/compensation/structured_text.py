@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from blark.parse import parse_source_code
+from blark.parse import get_parser, parse_source_code
 from lark.grammar import Rule
 from numpy.typing import NDArray
 
@@ -48,6 +48,9 @@ _TYPES = {"LREAL": np.float64, "REAL": np.float32, "INT": np.int64, "DINT": np.i
 
 def parse_blocks(text: str) -> dict[str, Any]:
     """Function blocks by lower-case name. One after the other: the parser's time grows faster than the text."""
+    parser = get_parser().parser.parser
+    # What a rule's first symbol expects, that symbol asks for itself: to list it with the rule is to make it again.
+    parser.predictions = {name: [r for r in rules if r.origin == name] for name, rules in parser.predictions.items()}
     blocks = re.findall(r"FUNCTION_BLOCK .*?END_FUNCTION_BLOCK", text, re.DOTALL)
     found = [parse_source_code(block).transform().items[0] for block in blocks]
     return {str(block.name).lower(): block for block in found}

@@ -115,17 +115,11 @@ class Solver(Protocol):
 # linearised problem is not valid so far away.
 OPEN = 100.0
 
-# Numbers in the residual's copies below which one backward pass through all of them beats a pass for each channel.
-_SMALL = 20_000
-
 
 def row_jacobian(
     function: Callable[..., Tensor], values: Tensor, data: tuple[Tensor, ...], channels: int
 ) -> tuple[Tensor, Tensor]:
     """Residual and Jacobian of every row by reverse differentiation, without a graph that could be differentiated.
-
-    Small batches go through one backward pass, in a copy for each channel: there the time goes with the number of
-    operations. Large ones take a pass for each channel.
 
     Args:
         function: `(values, *data)` -> `... x c`, leading dims independent.
@@ -136,13 +130,7 @@ def row_jacobian(
     Returns:
         residual `... x c` and Jacobian `... x c x k`.
     """
-    if channels == 1 or values.numel() * channels > _SMALL:
-        return jacobian_of(lambda point: function(point, *data), values)
-    copies = values.detach().expand(channels, *values.shape).clone().requires_grad_()
-    with torch.enable_grad():
-        value = function(copies, *data)
-        slope = torch.autograd.grad(value.diagonal(dim1=0, dim2=-1).sum(), copies, materialize_grads=True)[0]
-    return value[0].detach(), slope.movedim(0, -2)
+    return jacobian_of(lambda point: function(point, *data), values, copies=channels)
 
 
 class WeightedRows:

@@ -62,10 +62,7 @@ def closed_form_frames(rotation: Tensor, position: Tensor, measured: Frame, tool
         bases[0] = shah[0]
         there = [rotation.mT @ base.mT[..., None, :, :] @ measured[1] for base in bases[1:]]
         tools = [shah[1], *(nearest_rotation((share * turned).sum(-3)) for turned in there)]
-    found = [
-        _placed(base, turn, rotation, position, measured[0], weights) for base, turn in zip(bases, tools, strict=True)
-    ]
-    return torch.stack(found)
+    return _placed(torch.stack(bases), torch.stack(tools), rotation, position, measured[0], weights)
 
 
 def best_closed_form(
@@ -123,9 +120,9 @@ def rigid_body_frame(here: Frame, there: Frame, weights: Tensor, rotation_weight
 
 def _rotations_by_kronecker(rotation: Tensor, measured: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """R_b = R_m R_tᵀ R_aᵀ for all rows: the first singular pair of the mean of R_m ⊗ R_a (Shah 2013, eq. 28-31)."""
-    products = torch.einsum("...ij,...lk->...iljk", measured, rotation).flatten(-4)
-    mean = (weights[..., None, :] @ products)[..., 0, :] / weights.sum(-1, keepdim=True)
-    mean = mean.reshape(*mean.shape[:-1], 9, 9)
+    share = (weights / weights.sum(-1, keepdim=True))[..., None]
+    mean = (share * measured.flatten(-2)).mT @ rotation.flatten(-2)
+    mean = mean.reshape(*mean.shape[:-2], 3, 3, 3, 3).transpose(-3, -2).flatten(-4, -3).flatten(-2)
     left, _, right = torch.linalg.svd(mean)
     base, tool = left[..., 0].reshape(*left.shape[:-2], 3, 3), right[..., 0, :].reshape(*left.shape[:-2], 3, 3)
     sign = torch.linalg.det(base).sign()[..., None, None]
@@ -150,14 +147,12 @@ def _weighted_linear(design: Tensor, right: Tensor, weights: Tensor) -> Tensor:
 
     design `... x s x 3 x m`, right `... x s x 3`, weights `... x s`.
     """
-    m = design.shape[-1]
-    normal = (weights[..., None, :] @ (design.mT @ design).flatten(-2))[..., 0, :]
-    normal = normal.reshape(*normal.shape[:-1], m, m)
-    moment = ((weights[..., None, None] * right[..., None]) * design).sum((-3, -2))
-    ridge = torch.full((m,), _RIDGE, dtype=design.dtype)
+    flat = design.flatten(-3, -2)
+    weighed = (flat * weights.repeat_interleave(3, -1)[..., None]).mT
+    ridge = torch.full((design.shape[-1],), _RIDGE, dtype=design.dtype)
     ridge[-3:] = 0
     solved: Tensor = torch.linalg.solve(
-        normal + torch.diag_embed(ridge * weights.sum(-1, keepdim=True)), moment[..., None]
+        weighed @ flat + torch.diag_embed(ridge * weights.sum(-1, keepdim=True)), weighed @ right.flatten(-2)[..., None]
     )
     return solved[..., 0]
 

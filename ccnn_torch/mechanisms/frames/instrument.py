@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,9 +16,9 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.fit import fit_frames
 from ccnn_torch.mechanisms.frames.framed import Framed
-from ccnn_torch.mechanisms.frames.part import Part, all_read, has_orientation, place_with
+from ccnn_torch.mechanisms.frames.part import Part, all_places, all_read, has_orientation
 from ccnn_torch.mechanisms.frames.partial import Seen
-from ccnn_torch.mechanisms.frames.readings import READINGS, Pose, make_reading
+from ccnn_torch.mechanisms.frames.readings import READINGS, Place, Pose, make_reading
 from ccnn_torch.mechanisms.frames.set_ups import fit_set_ups
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
@@ -68,7 +68,8 @@ class Instrument(Seen):
         blind = next((p.reading.kind for p in parts if (p.reading.turns or p.place) and not turned), None)
         if blind is not None:
             raise InputError(f"mechanism '{mechanism.name}' has no orientation, which a {blind} on it needs")
-        home = all_read(parts, mechanism, mechanism.home_joints, mechanism.nominal, start, usual)
+        places = all_places(mechanism, parts, mechanism.home_joints, mechanism.nominal, usual)
+        home = all_read(parts, places, start, usual)
         super().__init__(mechanism, [*read, *given], [*home.tolist(), *usual.tolist()], own)
         self.parts, self.known, self._only_twice = parts, False, False
 
@@ -163,12 +164,18 @@ class Instrument(Seen):
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
         """What is read with these joints, and what is given by `guess` (home without), `... x p` [SI]."""
-        values, count, given = self.resolve(parameters), len(self.mechanism.geometry), self.given(guess)
-        read = all_read(self.parts, self.mechanism, joints, values[..., :count], values[..., count:], given)
+        values, given = self.resolve(parameters), self.given(guess)
+        read = self._read(self._places(joints, values, given), values, given)
         if self._only_twice:
             twice = [part.reading.twice for part in self.parts for _ in part.reading.read]
             read = torch.where(torch.tensor(twice), read, 0.0)
         return torch.cat([read, given.expand(*read.shape[:-1], -1)], -1)
+
+    def _places(self, joints: Tensor, values: Tensor, given: Tensor) -> list[Place]:
+        return all_places(self.mechanism, self.parts, joints, values[..., : len(self.mechanism.geometry)], given)
+
+    def _read(self, places: list[Place], values: Tensor, given: Tensor, twist: Tensor | None = None) -> Tensor:
+        return all_read(self.parts, places, values[..., len(self.mechanism.geometry) :], given, twist)
 
     def given(self, rows: Tensor | None) -> Tensor:
         """What the rows `... x p` were of, `... x g` [SI]; what is usual where there are none."""
@@ -255,13 +262,13 @@ class Instrument(Seen):
 
     def by_place(self, joints: Tensor, parameters: Tensor | None, guess: Tensor | None) -> Tensor:
         """Change of `frame` by a shift and a turn (about its own point) of what holds them, `... x c x 6`."""
-        values, count, given = self.resolve(parameters), len(self.mechanism.geometry), self.given(guess)
+        values, given = self.resolve(parameters), self.given(guess)
+        places = self._places(joints, values, given)
 
         def read(twist: Tensor) -> Frame:
-            every = self.parts, self.mechanism, joints, values[..., :count], values[..., count:], given, twist
-            return self.frame(all_read(*every))
+            return self.frame(self._read(places, values, given, twist))
 
-        return frame_jacobian(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype))
+        return frame_jacobian(read, torch.zeros(*joints.shape[:-1], 6, dtype=joints.dtype), len(self.channels))
 
     def _shown(self, joints: Tensor, rows: Tensor) -> list[tuple[Part, Tensor, Tensor, Tensor]]:
         """Each instrument with the joints `t x n` at which it read, and what it read and was pointed at there,
@@ -313,7 +320,7 @@ class Instrument(Seen):
         parts, machine = list[Part](), self.mechanism.nominal
         values = [machine]
         for part, q, rows, given in self._shown(joints, pose):
-            place = place_with(self.mechanism, part, q, machine, given)
+            (place,) = all_places(self.mechanism, [part], q, machine, given)
             parts.append(replace(part, reading=part.reading.suited(place, rows)))
             own = torch.tensor([p.nominal for p in parts[-1].parameters], dtype=torch.float64)
             values.append(parts[-1].start(place, rows, own))
@@ -341,6 +348,9 @@ class Instrument(Seen):
             )
         start = self._begun(q, x, unknown)
         x = torch.where(x.isnan(), self.home_pose, x)
+        # Where the machine is known it stands where it stands.
+        stands = free[0] >= len(self.mechanism.geometry)
+        places = self._places(q, start, self.given(x)) if stands else None
         group = torch.tensor(self.noise_groups())
         groups = torch.nn.functional.one_hot(group).double()
         kept, scale = torch.ones(len(q), dtype=torch.float64), torch.ones(self.compared, dtype=torch.float64)
@@ -348,31 +358,32 @@ class Instrument(Seen):
 
             def gap(values: Tensor, kept: Tensor = kept, start: Tensor = start, scale: Tensor = scale) -> Tensor:
                 full = start.expand(*values.shape[:-1], -1).index_copy(-1, torch.tensor(free), values)
-                return torch.where(seen, self._left(q, full, x), 0.0) / scale * kept[:, None]
+                return torch.where(seen, self._left(q, full, x, places), 0.0) / scale * kept[:, None]
 
             if groups.shape[-1] > 1:
                 # Readings of different kinds weigh as they scatter.
                 left = gap(start[free]) * scale
                 size = (left.square() @ groups).sum(0) / (seen.double() @ groups).sum(0).clamp_min(1)
                 scale = (groups @ size.sqrt()).clamp_min(1e-12)
-            found = levenberg_marquardt(
-                lambda v, gap=gap, scale=scale: gap(v, scale=scale).flatten(),
-                start[free],
+
+            def both(values: Tensor, gap: Callable[..., Tensor] = gap, scale: Tensor = scale) -> tuple[Tensor, Tensor]:
                 # A row's residual is of its own copy of the values: one pass for each reading and not for each row.
-                lambda v, gap=gap, scale=scale: jacobian_of(lambda at: gap(at, scale=scale), v.expand(len(q), -1))[
-                    1
-                ].flatten(0, 1),
-                max_iterations=100,
-            )
+                every = values.expand(len(q), -1)
+                value, slope = jacobian_of(lambda at: gap(at, scale=scale), every, copies=self.compared)
+                return value.flatten(), slope.flatten(0, 1)
+
+            found = levenberg_marquardt(gap, start[free], both=both, max_iterations=100)
             start = start.index_copy(0, torch.tensor(free), found.value)
-            left = torch.where(seen, self._left(q, start, x), 0.0) / scale
+            left = torch.where(seen, self._left(q, start, x, places), 0.0) / scale
             length = left.norm(dim=-1) * (self.compared / seen.sum(-1)).sqrt()
             kept = inlying(length.nan_to_num(nan=torch.inf), kept >= 0, self.compared, len(free)).double()
         return start
 
-    def _left(self, joints: Tensor, values: Tensor, rows: Tensor) -> Tensor:
-        """From what was read to what these parameters say, `s x c`."""
-        gap = frame_gap(self.frame(self.forward_kinematics(joints, values, rows)), self.frame(rows), 1.0)
+    def _left(self, joints: Tensor, values: Tensor, rows: Tensor, places: list[Place] | None) -> Tensor:
+        """From what was read to what these parameters say, `s x c`; places: of what holds the instruments, if known."""
+        given = self.given(rows)
+        read = self._read(places or self._places(joints, values, given), values, given)
+        gap = frame_gap(self.frame(read), self.frame(rows), 1.0)
         return gap[..., [k for k, c in enumerate(self.channels) if c.name]]
 
     def _begun(self, joints: Tensor, rows: Tensor, unknown: Sequence[str]) -> Tensor:
@@ -388,7 +399,8 @@ class Instrument(Seen):
                     break
         found = [start[:first]]
         for (part, q, mine, given), values in zip(each, own, strict=True):
-            found.append(part.start(place_with(arm, part, q, start[:first], given), mine, values))
+            (place,) = all_places(arm, [part], q, start[:first], given)
+            found.append(part.start(place, mine, values))
         return torch.cat(found)
 
 

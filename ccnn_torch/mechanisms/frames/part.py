@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -48,7 +49,7 @@ class Part:
         parts = {"": {}, "point": {f"{kind}point": 3}, "camera": {"mount": 6, "stand": 6}}[self.place]
         return tuple(Parameter(f"{n}_{c}", u, 0.0, scale=_THERE[u]) for n, k in parts.items() for c, u in FRAME[:k])
 
-    @property
+    @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """All of its own."""
         return tuple(replace(p, name=self.called(p.name)) for p in (*self.reading.parameters, *self.frames))
@@ -107,47 +108,50 @@ def has_orientation(mechanism: Mechanism) -> bool:
 
 
 def all_read(
-    parts: Sequence[Part],
-    mechanism: Mechanism,
-    joints: Tensor,
-    values: Tensor,
-    own: Tensor,
-    given: Tensor,
-    twist: Tensor | None = None,
+    parts: Sequence[Part], places: Sequence[Place], own: Tensor, given: Tensor, twist: Tensor | None = None
 ) -> Tensor:
     """What the instruments read, side by side, `... x c` [SI].
 
     Args:
-        values: of the mechanism, `... x k`.
-        own: of the instruments, `... x m`.
+        places: what holds each, as `all_places` says.
+        own: their parameters, `... x m`.
         given: what they were pointed at, `... x g`.
         twist: shift and turn of what holds them, `... x 6`.
     """
-    read, first, second = [], 0, 0
-    for part in parts:
-        ends = first + len(part.parameters), second + len(part.reading.given)
-        here = given[..., second : ends[1]]
-        there = place_with(mechanism, part, joints, values, here)
+    read = []
+    each = torch.split(own, [len(part.parameters) for part in parts], -1)
+    for part, there, values, here in zip(parts, places, each, _given_each(parts, given), strict=True):
         if twist is not None:
             turned = there.rotation
             if turned is not None:
                 turned = rotation_vector_to_matrix(twist[..., 3:]) @ turned
             there = there._replace(position=there.position + twist[..., :3], rotation=turned)
-        read.append(part(there, own[..., first : ends[0]], here))
-        first, second = ends
+        read.append(part(there, values, here))
     if len(read) == 1:
         return read[0]
     lead = leading_shape(*read)
     return torch.cat([one.expand(*lead, -1) for one in read], -1)
 
 
-def place_with(mechanism: Mechanism, part: Part, joints: Tensor, values: Tensor, given: Tensor) -> Place:
-    """Where what holds an instrument is, also with the joints that are given where its reading is of two places."""
-    there = place_of(mechanism, part.link, joints, values)
-    if not part.reading.twice:
-        return there
-    other = place_of(mechanism, part.link, given, values)
-    return there._replace(second=other.position, turned=other.rotation)
+def _given_each(parts: Sequence[Part], given: Tensor) -> tuple[Tensor, ...]:
+    """Of each instrument what it was pointed at."""
+    return torch.split(given, [len(part.reading.given) for part in parts], -1)
+
+
+def all_places(
+    mechanism: Mechanism, parts: Sequence[Part], joints: Tensor, values: Tensor, given: Tensor
+) -> list[Place]:
+    """Where what holds each instrument is; values: of the mechanism, `... x k`; given: as of `all_read`."""
+    held = {link: place_of(mechanism, link, joints, values) for link in dict.fromkeys(part.link for part in parts)}
+    places = []
+    for part, here in zip(parts, _given_each(parts, given), strict=True):
+        there = held[part.link]
+        if part.reading.twice:
+            # Also with the joints that are given.
+            other = place_of(mechanism, part.link, here, values)
+            there = there._replace(second=other.position, turned=other.rotation)
+        places.append(there)
+    return places
 
 
 def place_of(mechanism: Mechanism, link: int | None, joints: Tensor, values: Tensor) -> Place:
