@@ -12,10 +12,12 @@ from xml.etree.ElementTree import Element
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text, read_xml
 from ccnn_torch.files.yaml_file import parse_yaml
+from ccnn_torch.mechanisms.gears import read_gears
 from ccnn_torch.mechanisms.machines.links import compose
 from ccnn_torch.mechanisms.machines.serial import MOST_JOINTS, SerialArm
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
@@ -145,18 +147,14 @@ class _Table:
         return found
 
     def gears(self, types: Sequence[str], length: float) -> list[float | None]:
-        """Turns of each motor for one of its joint [1], or the lead of its screw [m]; none where nothing is told."""
-        value = self.content.get("gears", [])
-        if not isinstance(value, list) or ("gears" in self.content and len(value) != len(types)):
-            raise InputError(f"{self.path}: key 'gears' must list {len(types)} numbers, as [121, null, …]")
-        where = f"{self.path}: key 'gears', entry"
-        told = [None if v is None else _number(v, f"{where} {i}") for i, v in enumerate(value, 1)]
-        if wrong := [i for i, v in enumerate(told, 1) if v is not None and v <= 0]:
-            raise InputError(
-                f"{where} {wrong[0]} must be above 0, or null where nothing is known, got {told[wrong[0] - 1]:g}"
-            )
-        scales = [1.0 if kind == "revolute" else length for kind in types]
-        return [None if v is None else v * s for v, s in zip(told, scales, strict=False)]
+        """As of `read_gears`; none where the file does not tell them."""
+        if "gears" not in self.content:
+            return []
+        joints = [Coordinate(f"q{i}", "m" if kind == "prismatic" else "rad") for i, kind in enumerate(types, 1)]
+        where = f"{self.path}: key 'gears'"
+        return read_gears(
+            self.content["gears"], joints, where, lambda v, unit: _number(v, where) * (length if unit == "m" else 1.0)
+        )
 
     def masses(self, count: int) -> list[float]:
         """[kg]; none where the file does not tell them."""

@@ -15,6 +15,7 @@ from ccnn_torch.mechanisms.dh_file import read_dh_file, read_urdf
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.frames.instrument import Instrument, instrument
 from ccnn_torch.mechanisms.frames.partial import Partial, Seen
+from ccnn_torch.mechanisms.gears import read_gears
 from ccnn_torch.mechanisms.kinds.machine_file import build_machine, read_machine_file, template
 from ccnn_torch.mechanisms.machines.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.machines.five_bar import FiveBar
@@ -270,7 +271,8 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         allow_code: run the Python file that an identified machine's mechanism file names.
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
             framed: mechanism, its keys, base, tool, frame_per, tool_per; partial: mechanism, its keys, pose;
-            instrument: mechanism, its keys, kind, link, and those of the kind, or instruments; …).
+            instrument: mechanism, its keys, kind, link, and those of the kind, or instruments; …); of any machine
+            `gears`, see `Mechanism`.
 
     Raises:
         InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, a
@@ -293,6 +295,8 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
 
         return load_machine(spec, allow_code=allow_code)
     maker = _maker(spec)
+    apart = spec not in _EXAMPLES and "gears" not in inspect.signature(maker).parameters
+    gears = keys.pop("gears", None) if apart else None
     if is_plugin(spec):
         mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
     else:
@@ -300,6 +304,10 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
     plain = spec != "machine" and (spec in REGISTRY or is_plugin(spec))
     if plain and not isinstance(mechanism, Framed | Seen | Pair):
         mechanism.recipe = {"spec": spec, "keys": keys}
+    if gears is not None:
+        where = f"mechanism '{spec}': gears"
+        told = read_gears(gears, mechanism.joints, where, lambda v, unit: amount(str(v), unit, where))
+        mechanism.gears, mechanism.recipe["keys"]["gears"] = tuple(told), told
     return mechanism
 
 

@@ -10,6 +10,7 @@ from ccnn_torch.effects import Situation, default_gravity, make_effect
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism, mechanism_from_description
 from ccnn_torch.mechanisms.kinds.machine_file import KINDS, template
+from ccnn_torch.mechanisms.mechanism_file import urdf_text
 from ccnn_torch.mechanisms.pose import frame_jacobian
 from ccnn_torch.testing import check_mechanism
 
@@ -170,6 +171,25 @@ def test_drives_that_a_file_tells_are_the_machines_however_it_is_seen(tmp_path: 
     )
 
 
+def test_any_machine_takes_gears_as_a_key_and_keeps_them(tmp_path: Path) -> None:
+    arm = SerialArm("lift", "standard", [[0.0, 0.0, 0.1, 0.0], [0.3, 0.0, 0.0, 0.0]], ["prismatic", "revolute"])
+    (tmp_path / "arm.urdf").write_text(urdf_text(arm))
+    for spec, gears, si in (
+        ("five_bar", [50, None], (50.0, None)),
+        ("delta_linear", ["5 mm", None, 0.01], (0.005, None, 0.01)),
+        (str(tmp_path / "arm.urdf"), ["5 mm", 100], (0.005, 100.0)),
+    ):
+        made = load_mechanism(spec, gears=gears)
+        assert made.gears == mechanism_from_description(made.describe()).gears == pytest.approx(si)
+    framed = load_mechanism("framed", mechanism="five_bar", keys={"gears": [50, None]})
+    assert framed.gears == mechanism_from_description(framed.describe()).gears == (50.0, None)
+    for wrong in ([1], [1, "1 mm"], [0, 1], 3):
+        with pytest.raises(InputError, match=r"mechanism 'five_bar': gears"):
+            load_mechanism("five_bar", gears=wrong)
+    with pytest.raises(InputError, match="gears"):
+        load_mechanism("framed", mechanism="five_bar", gears=[50, 50])
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [
@@ -185,8 +205,8 @@ def test_drives_that_a_file_tells_are_the_machines_however_it_is_seen(tmp_path: 
         ("machine: hexapod\nnumbers: {L: +- 1 mm}", "numbers.L: '' is no number"),
         ("machine: gantry\nlimits: 3", "limits: must be as"),
         ("machine: gantry\ngears: {q9: 10 mm}", "gears: 'q9' is not known"),
-        ("machine: gantry\ngears: {q1: 10}", "gears.q1: '10' has no unit; write 10 mm"),
-        ("machine: gantry\ngears: {q1: 0 mm}", "gears.q1: must be above 0"),
+        ("machine: gantry\ngears: {q1: 10}", "gears: '10' has no unit; write 10 mm"),
+        ("machine: gantry\ngears: {q1: 0 mm}", "gears must be above 0"),
         ("machine: gantry\ngears: 100", "gears: must be as {q1: 80"),
         ("machine: gantry\nnumbers: 3", "must have lines such as"),
         ("machine: gantry\ntool_fram: identity", "the key 'tool_fram' is not known; did you mean 'tool_frame'"),

@@ -30,7 +30,7 @@ LINKS = np.array([0.22, 0.22, 0.28, 0.28, -0.08, 0, 0.08, 0])
 LOW, HIGH = np.array([-0.17, 0.24]), np.array([0.17, 0.42])
 HOOK, SPRING, PULL = np.array([0.25, 0.05]), 40.0, 12.0
 TIMES, NOISE, NEW, ALUMINIUM, STEEL = 100, 3e-6, 400, 23e-6, 11.5e-6
-KEYS = "{l: 0.22, L: 0.28, a: 0.08}"
+KEYS = "{l: 0.22, L: 0.28, a: 0.08, gears: [50, 50]}"
 OWN = f"mechanism: five_bar\nmechanism_keys: {KEYS}\n"
 FRAMED = f"mechanism: framed\nmechanism_keys: {{mechanism: five_bar, keys: {KEYS}}}\n"
 

@@ -20,10 +20,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.files.yaml_file import parse_yaml
+from ccnn_torch.mechanisms.gears import read_gears
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.spelling import hint
@@ -159,19 +161,16 @@ def _by_joint(content: Mapping[str, Any], key: str, form: str, joints: Sequence[
 def _gears(
     content: Mapping[str, Any], joints: Sequence[str], moves: Sequence[Sequence[str]], where: str
 ) -> list[float | None]:
-    """Turns of each joint's motor for one of its own [1], or the lead of its screw [m]; none where none is told."""
+    """As of `read_gears`; none where none is told."""
     given = _by_joint(content, "gears", "{q1: 80, q3: 20 mm}", joints, where)
-    found: list[float | None] = [None] * len(joints) if given else []
-    for i, (joint, (how, _)) in enumerate(zip(joints, moves, strict=True)):
-        if joint in given:
-            about = f"{where}: gears.{joint}"
-            text, unit = visible(str(given[joint])), "1" if how == "turn" else "m"
-            if unit == "m" and _BARE.fullmatch(text):
-                raise InputError(f"{about}: '{text}' has no unit; write {text} mm")
-            found[i] = value = _amount(text, unit, about)
-            if value <= 0:
-                raise InputError(f"{about}: must be above 0, not {text}")
-    return found
+    known = [Coordinate(joint, "rad" if how == "turn" else "m") for joint, (how, _) in zip(joints, moves, strict=True)]
+
+    def number(text: Any, unit: str) -> float:
+        if unit == "m" and _BARE.fullmatch(str(text)):
+            raise InputError(f"{where}: gears: '{text}' has no unit; write {text} mm")
+        return _amount(text, unit, f"{where}: gears")
+
+    return read_gears([given.get(joint) for joint in joints], known, f"{where}: gears", number) if given else []
 
 
 def _tables(
