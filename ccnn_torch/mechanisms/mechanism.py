@@ -309,22 +309,16 @@ class Mechanism(nn.Module):
         Returns:
             `... x 6 x n` ([m] above [rad], per joint unit), or `... x 3 x n` without orientation.
         """
-        parameters = self.resolve(parameters)
-        others = (parameters,) if guess is None else (parameters, guess)
-        return frame_jacobian(
-            lambda q: self.frame(self.forward_kinematics(q, parameters, guess)),
-            expand_leading(joints, *others),
-            len(self.channels),
-        )
+        parameters, count = self.resolve(parameters), len(self.channels)
+        at = expand_leading(joints, parameters, parameters if guess is None else guess)
+        return frame_jacobian(lambda q: self.frame(self.forward_kinematics(q, parameters, guess)), at, count)
 
     def parameter_jacobian(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
         """The same by the parameters, at joints `... x n`; `... x 6 x k` or `... x 3 x k`, per parameter's unit."""
-        values = self.resolve(parameters).expand(*joints.shape[:-1], -1)
-        return frame_jacobian(
-            lambda theta: self.frame(self.forward_kinematics(joints, theta, guess)), values, len(self.channels)
-        )
+        values, count = self.resolve(parameters).expand(*joints.shape[:-1], -1), len(self.channels)
+        return frame_jacobian(lambda theta: self.frame(self.forward_kinematics(joints, theta, guess)), values, count)
 
     def jacobian_at(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """As `jacobian`, where the pose of the joints is known, `... x p` [SI]; NaN where that is.
