@@ -126,13 +126,12 @@ class SerialArm(Closest):
             tool_offset: position of the tool, or "unknown"; replaces `tool` where the pose has no orientation.
             goal_tool: the tool that commanded poses are of, position and rotation vector; `tool` when None.
             limits: lowest and highest value per joint, for sampling only; a full turn or a metre when None.
-            unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight, drives: see the class.
+            unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight, drives, gears: see class.
             tables: of each joint the places and the errors of its pitch-error table there, or None.
             leans: pairs of a link (from 1), see the class, and its lean [rad].
             masses: of the links, `n` [kg]; unknown when there are none.
             centres: of mass of the links, each in the frame at its link's end, `n x 3` [m]; of an empty one halfway
                 from its joint's axis to the next.
-            gears: as of `Mechanism`.
             numbers: fields of a `Parameter`, and `of`: what one unit of it adds to links' and drives' parameters, by
                 name; `links` are then what is there without them.
 
@@ -178,11 +177,10 @@ class SerialArm(Closest):
         self.convention, self.orientation, self.rotation_weight = convention, orientation, rotation_weight
         self.unknown_frames, self.parallel_axes = tuple(sorted(unknown)), tuple(map(tuple, parallel_axes))
         self.frame_per, self.tool_per, self.gears = tuple(frame_per), tuple(tool_per), tuple(gears)
-        turn = [t == "revolute" for t in types]
-        span = limits or [(-math.pi, math.pi) if t else (0.0, 1.0) for t in turn]
+        span = limits or [(-math.pi, math.pi) if t == "revolute" else (0.0, 1.0) for t in types]
         self.register_buffer("axes", torch.tensor(axes or [[0.0, 0.0, 1.0]] * n, dtype=torch.float64))
         self.register_buffer("signs", torch.tensor(joint_sign or [1.0] * n, dtype=torch.float64))
-        self.register_buffer("revolute", torch.tensor(turn))
+        self.register_buffer("revolute", torch.tensor([t == "revolute" for t in types]))
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
         self.own_drives = Drives(drives, tables or [None] * n)
         self.drives, self._named = tuple(map(tuple, drives)), bool(numbers)
