@@ -65,6 +65,19 @@ def test_an_eccentric_encoder_is_no_weight() -> None:
     assert said.verdict["probability"] <= 0.6
 
 
+def test_a_period_that_the_file_tells_is_found_whatever_it_is() -> None:
+    """Of joints that turn whole numbers a turn are searched; a gear of 27.5 : 1 is told."""
+    there = rows_of("five_bar", 90, 3)
+    situation = replace(there, mechanism=load_mechanism("five_bar", gears=[27.5, 27.5]))
+    wave = acting(situation, "transmission", q1_sin=3e-4, q1_cos=2e-4, q2_cos=-3e-4)
+    pose = reached_with(there, [wave._replace(shape=torch.full((2,), 27.5, dtype=torch.float64))], 4)
+    said = diagnose_rows(situation, pose, effects=["transmission", "joint_gain", "compliance"])
+    found = next(e["parameters"] for e in said.effects if e["name"] == "transmission")
+    assert said.verdict["effects"] == ["transmission"] and not said.verdict["outside_library"]
+    assert found["q1 frequency"]["value"] == 27.5
+    assert found["q1 sin"]["value"] == pytest.approx(3e-4, rel=0.1)
+
+
 def test_noise_alone_is_no_cause() -> None:
     situation = rows_of("five_bar", 60, 5)
     said = diagnose_rows(situation, measured(situation, {}, 6))
