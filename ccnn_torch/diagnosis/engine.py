@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -114,6 +114,7 @@ def diagnose_rows(
     effects: Sequence[Effect | str] | None = None,
     seed: int = 0,
     instrument: Noise | None = None,
+    constant: Collection[str] = (),
 ) -> Diagnosis:
     """Diagnose rows of commanded joints and measured poses.
 
@@ -125,12 +126,15 @@ def diagnose_rows(
         seed: of folds and resampling.
         instrument: the noise as columns of the records have it; where there are none, and no `noise`, readings of one
             target show it.
+        constant: columns of the records that never change: what they say is not taken from the order of the rows.
 
     Raises:
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
     said = _judged(situation, measured, noise, effects, seed, instrument)
     for name, kind in of_order(situation).items():
+        if any(column.startswith(name) for column in constant):
+            continue
         columns = kind.columns(situation, measured_order(situation))
         # A term that follows the order of the rows leaves nothing to show.
         told = name == ROW and any(d.startswith("time") for d in said.judgement.drivers)

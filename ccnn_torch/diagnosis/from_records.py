@@ -164,15 +164,13 @@ def diagnose(
     mounts = _mounts(records, situation)
     if effects is None and len(mounts) > 1:
         effects = ["all", *(ByGroup(make_effect(name), _word(situation), mounts) for name in SET_ANEW)]
+    still, shown = constant_columns(records), _instrument(records, situation)
     with naming(records):
-        said = diagnose_rows(
-            situation, records.pose, noise_of(noise, situation), effects, seed, _instrument(records, situation)
-        )
+        said = diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed, shown, still)
     mounted = mount_notes(said, mounts, _word(situation))
     notes = [*records.missing, *said.notes, *mounted, *_unread(records, situation, said)]
     doubts = [*said.cautions, *([records.doubt] if records.doubt else [])]
     entries = {"notes": notes, "cautions": doubts, "machine": named_machine(said), "frames": frames_taken(said)}
-    still = constant_columns(records)
     entries["missing_covariates"] = [
         e | {"constant": still >= {c.partition("[")[0] for c in e["columns"]}}
         for e in said.content["missing_covariates"]

@@ -35,6 +35,11 @@ def test_backlash_is_named_by_directions_from_the_order_of_the_rows() -> None:
     found = diagnose_rows(bare, pose, effects=["geometry", "joint_offset", "backlash", "friction"])
     assert found.verdict["effects"] == ["backlash"] and found.verdict["probability"] <= 0.9, found.verdict
     assert any("taken from the order of the rows: record direction1[1]" in text for text in found.cautions)
+    # Not where the joints are said to have been approached from one side.
+    told = diagnose_rows(
+        bare, pose, effects=["geometry", "joint_offset", "backlash", "friction"], constant=["direction1"]
+    )
+    assert found.inferred and not told.inferred
     # The same rows in another order show no direction.
     shuffled = replace(bare, covariates=bare.covariates | {"time": bare.covariates["time"].flip(0).sin()})
     said = diagnose_rows(shuffled, pose)
