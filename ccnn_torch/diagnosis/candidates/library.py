@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis.candidates.atom import Atom, default_shape, textbook_s
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows, Shaped
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.rows import only_usable
-from ccnn_torch.diagnosis.residual.whitening import Whitening
+from ccnn_torch.diagnosis.residual.whitening import Whitening, without_fitted
 from ccnn_torch.effects import EXACT, Acting, Effect, Situation
 from ccnn_torch.effects.joints import Coupling
 from ccnn_torch.evidence.marginal_likelihood import GroupProducts, Prior, fit_single_groups, own_products
@@ -68,7 +68,7 @@ def candidates_about_nominal(
         fitted: columns of what was fitted before, `s x c0 x r`.
     """
     whole = [a for a in atoms if a.shape.numel() == 0]
-    parts = [p for p in single_joint_atoms(situation, whole, white, [residual] * len(whole)) if p is not None]
+    parts = [p for p in single_joint_atoms(situation, whole, white, [residual] * len(whole), fitted) if p is not None]
     parts += without_secondary(situation, whole)
     bare = white(fitted)
     beside = torch.cat([bare, *(white(a.columns) for a in whole)], -1)
@@ -81,7 +81,7 @@ def candidates_about_nominal(
         for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(without_unused_rows(_atom(situation, situation, atom.effect, shaped), usable))
-    starts += _in_few_joints(situation, starts, white, residual)
+    starts += _in_few_joints(situation, starts, white, residual, fitted)
     return [*map(_charged, [*whole, *parts]), *starts]
 
 
@@ -135,7 +135,7 @@ def candidates_about_set(
         asked += [atom] * len(here)
         left += here
     parts: dict[tuple[str, tuple[int, ...] | None], Atom] = {}
-    for part in single_joint_atoms(situation, asked, white, left):
+    for part in single_joint_atoms(situation, asked, white, left, fitted):
         if part is not None:
             parts.setdefault((part.name, part.used), part)
     atoms = [*map(_charged, [*whole, *parts.values(), *without_secondary(situation, whole)])]
@@ -156,7 +156,7 @@ def candidates_about_set(
         for shaped in shapes:
             if not any(_same_shape(a, shaped) for a in own):
                 own.append(without_unused_rows(_atom(situation, there, effect, shaped), usable))
-        atoms += [*own, *_in_few_joints(situation, own, white, beside(others))]
+        atoms += [*own, *_in_few_joints(situation, own, white, beside(others), fitted)]
     return atoms
 
 
@@ -235,7 +235,7 @@ class _Choice:
 
 
 def single_joint_atoms(
-    situation: Situation, atoms: Sequence[Atom], white: Whitening, y: Sequence[Tensor]
+    situation: Situation, atoms: Sequence[Atom], white: Whitening, y: Sequence[Tensor], fitted: Tensor
 ) -> list[Atom | None]:
     """Of every effect that is in several joints or legs the coefficients of the one that explains most, and of others
     beside it that the evidence is for, up to half of them; None where there is but one.
@@ -245,13 +245,14 @@ def single_joint_atoms(
         atoms: effects with all of their coefficients.
         white: noise and weights.
         y: what each is to explain, `s x c0` [m, rad].
+        fitted: as of `candidates_about_nominal`; what a joint does alike is none of its own.
     """
     choices: dict[int, _Choice] = {}
     for k, (atom, residual) in enumerate(zip(atoms, y, strict=True)):
         parts = _parts(situation, atom)
         if len(parts) > 1:
-            target = white(residual)
-            choices[k] = _Choice(parts, own_products(white(atom.columns), target), target.square().sum())
+            columns, target = without_fitted(white(fitted), [white(atom.columns), white(residual)[..., None]])
+            choices[k] = _Choice(parts, own_products(columns, target), target.square().sum())
     while going := [c for c in choices.values() if not c.done]:
         cut = [[GroupProducts(c.own.xx[p][:, p], c.own.xy[p]) for p in c.wider()] for c in going]
         counts = [len(group) for group in cut]
@@ -266,13 +267,15 @@ def single_joint_atoms(
     ]
 
 
-def _in_few_joints(situation: Situation, shaped: Sequence[Atom], white: Whitening, y: Tensor) -> list[Atom]:
+def _in_few_joints(
+    situation: Situation, shaped: Sequence[Atom], white: Whitening, y: Tensor, fitted: Tensor
+) -> list[Atom]:
     """Of effects with shapes, whose form is exact, those in few joints: what it would be in the others mends nothing.
 
     y: what they are to explain, `s x c0` [m, rad].
     """
     exact = [a for a in shaped if a.name in EXACT and a.used is None]
-    return [one for one in single_joint_atoms(situation, exact, white, [y] * len(exact)) if one is not None]
+    return [one for one in single_joint_atoms(situation, exact, white, [y] * len(exact), fitted) if one is not None]
 
 
 def without_secondary(situation: Situation, atoms: Sequence[Atom]) -> list[Atom]:
