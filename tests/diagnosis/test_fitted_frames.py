@@ -287,3 +287,24 @@ def test_the_base_of_a_framed_machine_is_fitted_first_without_outliers() -> None
     assert machine.with_nominal(found[0]).unknown_frames == ()
     with pytest.raises(InputError, match="base is true or false"):
         load_mechanism("framed", mechanism="delta", base=0.18)
+
+
+def test_a_gain_of_one_joint_is_asked_beside_what_frames_do() -> None:
+    """The base's turn is what the first joint's zero does: beside unknown frames it is no part of a gain."""
+    links = [[0.35, -1.5707963, 0.8, 0.0], [1.2, 0.0, 0.0, -1.5707963], [0.1, -1.5707963, 0.0, 0.0]]
+    links += [[0.0, 1.0471976, 1.4, 0.0], [0.0, -1.0471976, 0.17, 0.0], [0.0, 0.0, 0.15, 0.0]]
+    limits = [[-1.3, 1.3], [-0.6, 0.9], [-0.7, 0.5], [-2.5, 2.5], [-2.6, 2.6], [-2.8, 2.8]]
+    arm = SerialArm("painter", "standard", links, limits=limits, unknown_frames=["base", "tool"])
+    for seed in (1, 2):
+        generator = torch.Generator().manual_seed(seed)
+        joints = arm.sample_joints(200, generator)
+        moved = joints.clone()
+        moved[:, 1] += 3e-4 * joints[:, 1]
+        sizes = torch.tensor([4e-5] * 3 + [6e-5] * 3, dtype=torch.float64)
+        pose = arm.forward_kinematics(moved)
+        pose = pose + sizes * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
+        here = Situation(arm, joints, {}, default_gravity(arm), fit_frames(arm, joints, pose))
+        said = diagnose_rows(here, pose)
+        assert said.verdict["effects"] == ["joint_gain"] and said.verdict["probability"] > 0.9
+        named = next(e["parameters"] for e in said.effects if e["name"] == "joint_gain")
+        assert set(named) == {"q2", "q2 zero"}
