@@ -247,12 +247,13 @@ def single_joint_atoms(
         y: what each is to explain, `s x c0` [m, rad].
         fitted: as of `candidates_about_nominal`; what a joint does alike is none of its own.
     """
-    choices: dict[int, _Choice] = {}
-    for k, (atom, residual) in enumerate(zip(atoms, y, strict=True)):
-        parts = _parts(situation, atom)
-        if len(parts) > 1:
-            columns, target = without_fitted(white(fitted), [white(atom.columns), white(residual)[..., None]])
-            choices[k] = _Choice(parts, own_products(columns, target), target.square().sum())
+    parts = {k: each for k, atom in enumerate(atoms) if len(each := _parts(situation, atom)) > 1}
+    whitened = [white(v) for k in parts for v in (atoms[k].columns, y[k][..., None])]
+    free = iter(without_fitted(white(fitted), whitened))
+    choices = {
+        k: _Choice(parts[k], own_products(columns, target), target.square().sum())
+        for k, columns, target in zip(parts, free, free, strict=True)
+    }
     while going := [c for c in choices.values() if not c.done]:
         cut = [[GroupProducts(c.own.xx[p][:, p], c.own.xy[p]) for p in c.wider()] for c in going]
         counts = [len(group) for group in cut]
