@@ -316,5 +316,5 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
             f"the model in {model.name}",
             compensator,
             calls,
-            compensator.geometry is None and compensator.effects is None,
+            compensator.machine is None,
         )

@@ -15,16 +15,15 @@ import pytest
 import torch
 from frozen import frozen
 from module_graph import to_onnx
-from torch import Tensor
+from torch import Tensor, nn
 from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.prepare import over_all_rows, prepare
 from ccnn_torch.cli.application import app
-from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
+from ccnn_torch.compensation import PhysicalEffects, expand_effects, load_model
 from ccnn_torch.compensation.model_files.metadata import open_onnx
-from ccnn_torch.compensation.networks import describe_network, network_from_description
 from ccnn_torch.diagnosis.from_file import Verdict, read_verdict
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, measured_pose, reached
 from ccnn_torch.effects.covariates import draw_covariates
@@ -179,7 +178,7 @@ def test_a_run_from_the_command_line_and_its_files(cli: Cli, tmp_path: Path) -> 
     assert pose["after"]["rms"]["median"] < 1.3 * 2**0.5 * NOISE < 0.2 * pose["before"]["rms"]["median"]
     assert "effects + constant removes" in (out / "results.md").read_text(encoding="utf-8")
     card = json.loads((out / "card.json").read_text(encoding="utf-8"))
-    assert card["format"] == "ccnn_torch compensator 7"
+    assert card["format"] == "ccnn_torch compensator 8"
     assert set(card["machine"]["effects"]["numbers"]) == {"joint_gain"}
     # The effect looks at no column, so that the model asks for none.
     assert card["covariates"] == []
@@ -242,21 +241,18 @@ def test_the_module_does_what_the_effects_do(name: str, effects: tuple[str, ...]
     for effect in map(make_effect, effects):
         sizes = [0.0 if c.secondary else 0.1 * c.scale for c in effect.coefficients(situation)]
         acting.append(Acting(effect, usual(effect, situation), torch.tensor(sizes, dtype=torch.float64)))
-    care = Care(0.3, 1e-3)
-    module = expand_effects(situation, acting, [*covariates], 0.1, care)
+    module = expand_effects(situation, acting, [*covariates], 0.1)
     given = torch.stack([*covariates.values()], -1)
-    deviation = module(joints, given)
-    exact = effect_deviation(situation, acting, mechanism.jacobian, care)
-    size = float(exact.abs().max())
-    torch.testing.assert_close(deviation, exact, rtol=0, atol=1e-4 * size)
-    # Joints that stand where the machine with the effects stands.
-    wanted = measured_pose(situation, reached(situation, acting))
-    there = mechanism.forward_kinematics(joints + exact, guess=wanted)
-    left, gap = (mechanism.pose_error(wanted, pose).position for pose in (there, situation.pose))
-    assert float(left.median()) < 0.02 * float(gap.median())
+    for found, kind in zip(module.changes(joints, given), ("joints", "pose"), strict=True):
+        changes = [one.change(situation) for one in acting if one.effect.kind == kind]
+        assert (found is None) == (not changes)
+        if found is not None:
+            exact = torch.stack(changes).sum(0)
+            torch.testing.assert_close(found, exact, rtol=0, atol=1e-4 * float(exact.abs().max()))
     # Whatever comes in, what comes out is finite.
     odd = torch.cat([joints * 50, joints * 0 + 1e3])
-    assert bool(torch.isfinite(module(odd, given.repeat(2, 1) * 100)).all())
+    for found in module.changes(odd, given.repeat(2, 1) * 100):
+        assert found is None or bool(torch.isfinite(found).all())
 
 
 def test_an_exported_graph_has_the_numbers_of_the_effects() -> None:
@@ -270,15 +266,30 @@ def test_an_exported_graph_has_the_numbers_of_the_effects() -> None:
     for effect in map(make_effect, ("thermal", "backlash")):
         sizes = [c.scale for c in effect.coefficients(situation)]
         acting.append(Acting(effect, usual(effect, situation), torch.tensor(sizes, dtype=torch.float64)))
-    module = expand_effects(situation, acting, [*covariates], 0.1, Care(0.04, 0.0, 2.0, 4.0))
+    module = expand_effects(situation, acting, [*covariates], 0.1)
     given = torch.stack([*covariates.values()], -1)
-    model = to_onnx(module, {"joints": joints, "covariates": given}, ["deviation"])
+    model = to_onnx(_Moved(module), {"joints": joints, "covariates": given}, ["moved"])
     session = open_onnx(model.SerializeToString())
     found = session.run(None, {"joints": joints.numpy(), "covariates": given.numpy()})[0]
-    np.testing.assert_allclose(found, module(joints, given).numpy(), rtol=0, atol=1e-13)
-    again = network_from_description(json.loads(json.dumps(describe_network(module))))
+    wanted = module.changes(joints, given)
+    np.testing.assert_allclose(found, _Moved(module)(joints, given).numpy(), rtol=0, atol=1e-13)
+    again = PhysicalEffects.from_description(json.loads(json.dumps(module.describe())))
     again.load_state_dict(module.state_dict())
-    assert torch.equal(again(joints, given), module(joints, given))
+    for one, other in zip(again.changes(joints, given), wanted, strict=True):
+        assert (one is None and other is None) or torch.equal(one, other)
+
+
+class _Moved(nn.Module):
+    """What the effects add to the joints, as a module."""
+
+    def __init__(self, effects: PhysicalEffects) -> None:
+        super().__init__()
+        self.effects = effects
+
+    def forward(self, joints: Tensor, covariates: Tensor) -> Tensor:
+        moved = self.effects.changes(joints, covariates)[0]
+        assert moved is not None
+        return moved
 
 
 def edited(played: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None]) -> str:

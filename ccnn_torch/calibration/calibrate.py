@@ -16,7 +16,7 @@ from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
 from ccnn_torch.calibration.fitting import Comparison, Fitted, compare, fit_method, on_other_rows, refit
 from ccnn_torch.calibration.prepare import Prepared, damping_of, ends_of, over_all_rows, prepare
 from ccnn_torch.calibration.result import best_method, chosen_by, plan_of, run_results
-from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
+from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError, Seen
@@ -250,14 +250,10 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
             inputs = torch.cat([inputs, torch.cat([second, inputs[:, n:]], -1)])
             deviations = deviations.repeat(2, 1)
     names = [c.name for c in covariates]
-    physics = {} if prepared.physics is None else prepared.physics.modules(repeat, there, margin, names)
-    if "machine" in physics:
-        physics["machine"].ends = ends_of(config, prepared.covariate_coordinates)
-    elif config.compensation.ends and physics.get("effects") is not None:
-        raise MethodFailedError("compensation.ends: effects of this machine are fitted to what was measured; remove it")
-    if physics and "machine" not in physics and limit is None:
-        # What geometry and effects leave at singular poses can be larger than what was there.
-        limit = default_limit(prepared.total[repeat, there])
+    machine = None
+    if prepared.physics is not None:
+        machine = prepared.physics.machine(repeat, there, margin, names)
+        machine.ends = ends_of(config, prepared.covariate_coordinates)
     return fit_compensator(
         network,
         scaling,
@@ -268,7 +264,7 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
         limit=limit,
         margin=margin,
         sd_scale=sd_scale,
-        **physics,
+        machine=machine,
     )
 
 

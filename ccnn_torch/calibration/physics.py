@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.dataset import Dataset, pad_rows, rows_of
-from ccnn_torch.compensation import machine_parts
+from ccnn_torch.compensation import Machine, machine_of
 from ccnn_torch.diagnosis.from_file import (
     TRAINING_ROWS,
     Known,
@@ -118,7 +118,7 @@ class Physics:
         """Names of the covariates without which the effects change."""
         return used_covariates(self.situations[repeat], self.acting[repeat])
 
-    def modules(self, repeat: int, rows: Tensor, margin: float, covariates: list[str]) -> dict[str, Any]:
+    def machine(self, repeat: int, rows: Tensor, margin: float, covariates: list[str]) -> Machine:
         """The machine of one repeat for a model file, as `fit_compensator` takes it.
 
         Args:
@@ -127,7 +127,7 @@ class Physics:
             covariates: names of the compensator's, in order.
 
         Raises:
-            InputError, MethodFailedError: see `machine_parts`.
+            InputError, MethodFailedError: see `machine_of`.
         """
         there, values = self.in_own_base(repeat, rows)
         # Commands are for whole poses, whatever of them was measured; but of a tool that was seen in part the rest is
@@ -135,7 +135,7 @@ class Physics:
         same = (len(a.effect.coefficients(there.whole)) == len(a.coefficients) for a in self.acting[repeat])
         there = there.visits if all(same) else there
         values = values[: len(there.mechanism.geometry)]
-        return machine_parts(there, self.acting[repeat], values, covariates, margin)
+        return machine_of(there, self.acting[repeat], values, covariates, margin)
 
     def in_own_base(self, repeat: int, rows: Tensor) -> tuple[Situation, Tensor]:
         """Some rows on the nominal machine, and all parameters of the real one, `k` [SI].

@@ -4,26 +4,19 @@ from ccnn_torch.doors import door
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from ccnn_torch.compensation.any_machine import build_machine as build_machine, machine_of as machine_of
     from ccnn_torch.compensation.compensator import (
         Compensator as Compensator,
         Solution as Solution,
-        default_limit as default_limit,
     )
     from ccnn_torch.compensation.domain import Domain as Domain
     from ccnn_torch.compensation.effects import (
-        Care as Care,
         PhysicalEffects as PhysicalEffects,
-        effect_deviation as effect_deviation,
         expand_effects as expand_effects,
-        gains as gains,
     )
     from ccnn_torch.compensation.expansions import expand as expand
-    from ccnn_torch.compensation.fit import (
-        fit_compensator as fit_compensator,
-        geometric_deviation as geometric_deviation,
-        machine_parts as machine_parts,
-    )
-    from ccnn_torch.compensation.machine import Machine as Machine, Rule as Rule, build_machine as build_machine
+    from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
+    from ccnn_torch.compensation.machine import Machine as Machine, Rule as Rule
     from ccnn_torch.compensation.model_files.identified import sign_model as sign_model
     from ccnn_torch.compensation.model_files.load import (
         LoadedModel as LoadedModel,

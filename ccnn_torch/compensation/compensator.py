@@ -11,8 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.compensation.domain import Domain
-from ccnn_torch.compensation.effects import PhysicalEffects
-from ccnn_torch.compensation.expansions import ChebyshevExpansion
 from ccnn_torch.compensation.machine import Machine
 from ccnn_torch.compensation.networks import UncertainNetwork
 from ccnn_torch.compensation.outputs import WAYS
@@ -63,8 +61,7 @@ class Compensator(nn.Module):
 
     With a `machine` the network has learned only what that leaves, and the limit and the guard hold for the network
     alone: the machine inverts its own forward map, with what was learned in it, in `iterations` steps, and the whole
-    deviation is bounded by `most`. With `geometry` and `effects`, the expansions of machines without closed forms, r(q)
-    the network's guarded part and γ(q) their deviation, δ(q) = r(q) + γ(q + r(q)), which fades with r.
+    deviation is bounded by `most`.
 
     `sd` is the standard deviation of a newly measured δ about it: inside the domain by the network's own `variance`
     and `sd_scale`, outside by how the training deviations scatter about `safe`, between the two by the guard's weight.
@@ -86,9 +83,6 @@ class Compensator(nn.Module):
         share: of what the network learned beside its mean that is applied [1]; below 1 where all of it was too steep.
             The scaling has it already, and a model file does not store it.
         unsettled: share of regular points in and around the domain at which the machine's command does not settle.
-        geometry: commanded joints `... x n` -> γ(q) = g(f(q)) - q, `... x n` [SI], f the identified forward and g the
-            nominal inverse kinematics; None without one.
-        effects: commanded joints and covariates -> ε `... x n` [SI]; None without one.
         machine: the one that was identified; None without one.
     """
 
@@ -111,8 +105,6 @@ class Compensator(nn.Module):
         iterations: int,
         sd_scale: Tensor | None = None,
         safe_sd: Tensor | None = None,
-        geometry: ChebyshevExpansion | None = None,
-        effects: PhysicalEffects | None = None,
         secant: bool = False,
         machine: Machine | None = None,
         most: Tensor | None = None,
@@ -120,8 +112,6 @@ class Compensator(nn.Module):
         super().__init__()
         self.network = network
         self.machine = machine
-        self.geometry = geometry
-        self.effects = effects
         self.scaling = scaling
         self.domain = domain
         self.register_buffer("limit", limit)
@@ -205,8 +195,8 @@ class Compensator(nn.Module):
 
     @property
     def export_tolerance(self) -> float:
-        """Share of the limit to which exports agree: 1e-12, or what network, geometry or effects ask for."""
-        parts = (self.network, self.geometry, self.effects, self.machine)
+        """Share of the limit to which exports agree: 1e-12, or what network or machine ask for."""
+        parts = (self.network, self.machine)
         return max(float(getattr(part, "export_tolerance", TOLERANCE)) for part in parts)
 
     def hook(self, warn: bool = True) -> Hook:

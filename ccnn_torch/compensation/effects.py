@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ccnn_torch.compensation.expansions import ChebyshevExpansion, expand
-from ccnn_torch.compensation.kinematics import ClosedKinematics, inverse
+from ccnn_torch.compensation.kinematics import ClosedKinematics
 from ccnn_torch.effects import Acting, Situation, labelled, make_effect
 from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
 
@@ -105,10 +105,6 @@ class Fields(nn.Module):
         # A cached property that is in the instance's dictionary is not computed again.
         situation.__dict__.update(values | constants)
         return situation
-
-    def jacobian(self, joints: Tensor) -> Tensor:
-        """At joints `s x n`, `s x c x n`."""
-        return self.values(joints, {"jacobian"})["jacobian"]
 
     def values(self, joints: Tensor, names: set[str]) -> dict[str, Tensor]:
         """Some of the quantities at joints `s x n`, each `s x shape`."""
@@ -208,74 +204,8 @@ def make_fields(mechanism: Mechanism, gravity: Tensor, names: set[str], joints: 
     return Fields(layout, source, constants, whole.samples)
 
 
-# Joints that move the platform less than this are held back [m per joint unit]: a thousandth of what is usual.
-_LEAST_DAMPING = 1e-3
-# A Jacobian from here on is none.
-_LOST = 1e6
-
-
-class Care(NamedTuple):
-    """How effects are brought to the joints, and where they are not, since near a singular pose they are out of hand.
-
-    Attributes:
-        rotation_weight: of rotation against position [m/rad].
-        damping: directions in which a joint moves the platform less than this are held back [m per joint unit].
-        gain: where the joints move the platform by more than this (Frobenius norm of the weighted Jacobian), what the
-            effects take from the kinematics is held, and falls beyond with its square [m per joint unit].
-        inverse_gain: the same of the Jacobian's damped inverse, for effects on the pose [joint unit per m].
-        free: names of effects that look at nothing of the kinematics, and are never held back.
-    """
-
-    rotation_weight: float
-    damping: float
-    gain: float = math.inf
-    inverse_gain: float = math.inf
-    free: tuple[str, ...] = ()
-
-
-def effect_deviation(
-    here: Situation, acting: Sequence[Acting], jacobian: Callable[[Tensor], Tensor], care: Care
-) -> Tensor:
-    """Joint deviation with which the nominal machine has the pose of the machine with the effects.
-
-    Effects on joints count as they are. The change of the pose by the others is brought to the joints by the damped
-    inverse of the Jacobian half way (the midpoint rule), which leaves the third order of the deviation.
-
-    Args:
-        here: the rows as commanded.
-        acting: effects with their numbers.
-        jacobian: of position and rotation vector, at joints `... x s x n` -> `... x s x c x n`.
-        care: what is done near singular poses.
-
-    Returns:
-        `... x s x n` [joint's unit], finite.
-    """
-    free, moved, shift = torch.zeros_like(here.joints), torch.zeros_like(here.joints), None
-    for one in acting:
-        change = one.change(here)
-        if one.effect.kind == "joints":
-            free, moved = (free + change, moved) if one.effect.name in care.free else (free, moved + change)
-            continue
-        if one.effect.kind == "parameters":
-            change = (here.parameter_jacobian @ change.unsqueeze(-1)).squeeze(-1)
-        shift = change if shift is None else shift + change
-    if all(one.effect.name in care.free for one in acting):
-        return free
-    slope, lost = _weighted(here.jacobian, care.rotation_weight)
-    share = _held(slope.square().sum((-2, -1)) + lost, care.gain).unsqueeze(-1)
-    moved = share * torch.nan_to_num(moved, posinf=0.0, neginf=0.0)
-    if shift is None:
-        return free + moved
-    shift = _weights(here.jacobian, care.rotation_weight) * torch.nan_to_num(shift, posinf=0.0, neginf=0.0)
-    inverse = _lifting(slope, care.damping)
-    share = share * _held(inverse.square().sum((-2, -1)), care.inverse_gain).unsqueeze(-1)
-    first = (inverse @ shift.unsqueeze(-1)).squeeze(-1)
-    half_way = _weighted(jacobian(here.joints + free + moved + 0.5 * share * first), care.rotation_weight)[0]
-    return free + moved + share * (_lifting(half_way, care.damping) @ shift.unsqueeze(-1)).squeeze(-1)
-
-
 class PhysicalEffects(nn.Module):
-    """`effect_deviation` of one machine with known numbers, for one row at a time, as a graph that can be exported.
+    """Effects of one machine with known numbers, for one row at a time, as a graph that can be exported.
 
     A row knows nothing of the rows before it: effects act as on a machine that has settled under its covariates.
 
@@ -284,13 +214,10 @@ class PhysicalEffects(nn.Module):
         covariates: names of the columns that come with the joints.
         acting: effects with their numbers; their own code runs on the fields.
         fields: what the effects see of the nominal machine.
-        care: what is done near singular poses; None for an arm, whose command is solved for with the effects in it.
         gravity: `3` [m/s²].
         numbers: of every effect by name and coefficient, for the model's card.
-        export_tolerance: share of the limit to which exports agree.
     """
 
-    export_tolerance = 1e-9
     gravity: Tensor
 
     def __init__(
@@ -300,7 +227,6 @@ class PhysicalEffects(nn.Module):
         covariates: Sequence[str],
         acting: Sequence[Acting],
         fields: Fields,
-        care: Care | None,
         numbers: Mapping[str, Mapping[str, float]],
     ) -> None:
         super().__init__()
@@ -308,7 +234,6 @@ class PhysicalEffects(nn.Module):
         self._mechanism = (mechanism,)
         self.covariates = list(covariates)
         self.fields = fields
-        self.care = care
         self.numbers = {name: dict(values) for name, values in numbers.items()}
         self.register_buffer("gravity", gravity.detach().clone())
         self._effects = [one.effect for one in acting]
@@ -324,16 +249,12 @@ class PhysicalEffects(nn.Module):
             for i, effect in enumerate(self._effects)
         ]
 
-    def forward(self, joints: Tensor, covariates: Tensor) -> Tensor:
-        """joints: commanded, `... x n` [SI]; covariates: `... x m` [SI]; returns the deviation, `... x n` [SI]."""
-        assert self.care is not None
-        here = self._situation(joints, covariates)
-        return effect_deviation(here, self.acting, self.fields.jacobian, self.care).reshape(joints.shape)
-
     def changes(self, joints: Tensor, covariates: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """What the effects add to joints `... x n` and to position and rotation vector `... x c` [SI]; None for none.
 
-        Arguments as of a call.
+        Args:
+            joints: commanded, `... x n` [SI].
+            covariates: `... x m` [SI].
         """
         here, found = self._situation(joints, covariates), dict[str, Tensor]()
         for one in self.acting:
@@ -355,12 +276,10 @@ class PhysicalEffects(nn.Module):
     def describe(self) -> dict[str, Any]:
         """Everything `from_description` needs; the tensors are stored beside it."""
         return {
-            "kind": "physical_effects",
             "mechanism": self._mechanism[0].describe(),
             "covariates": self.covariates,
             "acting": [[one.effect.name, len(one.shape), len(one.coefficients)] for one in self.acting],
             "fields": self.fields.describe(),
-            "care": None if self.care is None else [None if value == math.inf else value for value in self.care],
             "numbers": self.numbers,
         }
 
@@ -369,11 +288,6 @@ class PhysicalEffects(nn.Module):
         """The module as it was described, its tensors 0."""
         # The reader of the file that contains this decides whether code may run.
         mechanism = mechanism_from_description(description["mechanism"], allow_code=True)
-        care = None
-        if description["care"] is not None:
-            weight, damping, *most, free = description["care"]
-            gain, inverse_gain = (math.inf if m is None else float(m) for m in most)
-            care = Care(weight, damping, gain, inverse_gain, tuple(free))
         acting = [
             Acting(make_effect(name), *(torch.zeros(size, dtype=torch.float64) for size in sizes))
             for name, *sizes in description["acting"]
@@ -384,7 +298,6 @@ class PhysicalEffects(nn.Module):
             description["covariates"],
             acting,
             Fields.from_description(description["fields"], mechanism),
-            care,
             description["numbers"],
         )
 
@@ -394,7 +307,6 @@ def expand_effects(
     acting: Sequence[Acting],
     covariates: Sequence[str],
     margin: float,
-    care: Care | None,
 ) -> PhysicalEffects:
     """Effects with their numbers as a module that a model file can hold.
 
@@ -403,7 +315,6 @@ def expand_effects(
         acting: effects of the library, without time.
         covariates: names of the compensator's covariates, in order.
         margin: of the compensator's domain.
-        care: what is done near singular poses, None for an arm; its `free` is found here.
 
     Raises:
         InputError, MethodFailedError: what the effects see of the machine cannot be expanded over these joints.
@@ -411,57 +322,17 @@ def expand_effects(
     mechanism, few = situation.mechanism, slice(0, 8)
     given = {name: value[few] for name, value in situation.covariates.items()}
     names: set[str] = set()
-    free = []
     for one in acting:
-        own = looked_at(Situation(mechanism, situation.joints[few], given, situation.gravity), one.change)
-        names |= own
-        if one.effect.kind == "joints" and not own:
-            free.append(one.effect.name)
-        elif care is not None:
-            names |= {"jacobian"} | ({"parameter_jacobian"} if one.effect.kind == "parameters" else set())
+        names |= looked_at(Situation(mechanism, situation.joints[few], given, situation.gravity), one.change)
     fields = make_fields(mechanism, situation.gravity, names, situation.joints, margin)
     numbers: dict[str, dict[str, float]] = {}
     for label, one in labelled(acting):
         named = [c.name for c in one.effect.coefficients(situation)] + [s.name for s in one.effect.shapes(situation)]
         values = [*one.coefficients.tolist(), *one.shape.tolist()]
         numbers[label] = dict(zip(named, values, strict=True))
-    care = None if care is None else care._replace(free=tuple(free))
-    module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, care, numbers)
+    module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, numbers)
     module.requires_grad_(False)
     # Effects that ask which of their columns the workspace shows keep the answer; a traced graph could not ask.
     columns = [given.get(name, torch.zeros_like(situation.joints[few, 0])) for name in module.covariates]
     module.changes(situation.joints[few], torch.stack(columns, -1) if columns else situation.joints[few, :0])
     return module
-
-
-def gains(jacobian: Tensor, care: Care) -> tuple[Tensor, Tensor]:
-    """What `Care` bounds as `gain` and `inverse_gain`, of `... x c x n`, `...` each."""
-    slope, lost = _weighted(jacobian, care.rotation_weight)
-    inverse = _lifting(slope, care.damping)
-    return (slope.square().sum((-2, -1)) + lost).sqrt(), inverse.square().sum((-2, -1)).sqrt()
-
-
-def _weighted(jacobian: Tensor, rotation_weight: float) -> tuple[Tensor, Tensor]:
-    """Jacobian with its rotation weighted, `... x c x n`, 0 where there is none, and there a large number, `...`."""
-    # A comparison with NaN is false.
-    there = jacobian.abs() < _LOST
-    slope = torch.where(there, jacobian, torch.zeros_like(jacobian))
-    lost = torch.where(there, torch.zeros_like(jacobian), torch.full_like(jacobian, _LOST**2)).sum((-2, -1))
-    return slope * _weights(jacobian, rotation_weight).unsqueeze(-1), lost
-
-
-def _weights(jacobian: Tensor, rotation_weight: float) -> Tensor:
-    return torch.tensor([1.0] * 3 + [rotation_weight] * (jacobian.shape[-2] - 3), dtype=jacobian.dtype)
-
-
-def _held(square: Tensor, most: float) -> Tensor:
-    """1 up to `most` squared, and falling in proportion beyond, `...`: what grows with the square is held there."""
-    if math.isinf(most):
-        return torch.ones_like(square)
-    return 1 / (square / most**2).clamp_min(1.0)
-
-
-def _lifting(slope: Tensor, damping: float) -> Tensor:
-    """Damped inverse of a weighted Jacobian, `... x n x c`."""
-    unit = torch.eye(slope.shape[-1], dtype=slope.dtype)
-    return inverse(slope.mT @ slope + max(damping, _LEAST_DAMPING) ** 2 * unit) @ slope.mT

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -31,10 +30,8 @@ class ChebyshevExpansion(nn.Module):
     Attributes:
         centre, half_range: of the joints, `n` [SI].
         coefficients: `terms x o` [SI].
-        export_tolerance: share of the limit to which exports agree; sums of many terms are rounded.
     """
 
-    export_tolerance = 1e-10
     centre: Tensor
     half_range: Tensor
     coefficients: Tensor
@@ -44,10 +41,10 @@ class ChebyshevExpansion(nn.Module):
         """outputs: how many, as many as joints when 0."""
         super().__init__()
         exponents = _exponents(len(centre), degree)
-        self.degree = degree
+        self.degree, self.outputs = degree, outputs or len(centre)
         self.register_buffer("centre", centre)
         self.register_buffer("half_range", half_range)
-        self.register_buffer("coefficients", centre.new_zeros(len(exponents), outputs or len(centre)))
+        self.register_buffer("coefficients", centre.new_zeros(len(exponents), self.outputs))
         pick = torch.nn.functional.one_hot(exponents.mT, degree + 1).mT.to(centre.dtype)
         # `n x (degree + 1) x terms`
         self.register_buffer("_pick", pick.contiguous(), persistent=False)
@@ -55,16 +52,6 @@ class ChebyshevExpansion(nn.Module):
     def forward(self, joints: Tensor) -> Tensor:
         """joints: `... x n` [SI]; returns `... x o` [SI]."""
         return self.basis(joints) @ self.coefficients
-
-    def describe(self) -> dict[str, Any]:
-        """Everything `from_description` needs; the tensors are stored beside it."""
-        return {"kind": "expanded_geometry", "joints": len(self.centre), "degree": self.degree}
-
-    @classmethod
-    def from_description(cls, description: dict[str, Any]) -> ChebyshevExpansion:
-        """An expansion of the described size, 0 everywhere."""
-        blank = torch.ones(description["joints"], dtype=torch.float64)
-        return cls(blank.clone(), blank.clone(), description["degree"])
 
     def basis(self, joints: Tensor) -> Tensor:
         """Products of Chebyshev polynomials, `... x terms` [1]."""

@@ -6,16 +6,15 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from ccnn_torch.compensation.any_machine import machine_of
 from ccnn_torch.compensation.compensator import TOLERANCE, Compensator, default_limit
 from ccnn_torch.compensation.domain import POINTS, Domain, spread_points
-from ccnn_torch.compensation.effects import Care, PhysicalEffects, expand_effects, gains
-from ccnn_torch.compensation.expansions import ChebyshevExpansion, expand
-from ccnn_torch.compensation.machine import ASTRAY, FARTHEST, Machine, build_machine, closed_form_of
+from ccnn_torch.compensation.machine import ASTRAY, FARTHEST, Machine
 from ccnn_torch.compensation.routines import Functions, Variables, next_step, routines_of
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.effects import Acting, Situation, default_gravity
@@ -23,7 +22,6 @@ from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners.constant import ConstantNetwork
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.training import Scaling
 
 # A unique command exists below a slope of 1. At this one the fixed point takes 40 steps, and
@@ -140,8 +138,6 @@ def fit_compensator(
     margin: float = 0.1,
     transition: float = 0.5,
     sd_scale: Tensor | None = None,
-    geometry: ChebyshevExpansion | None = None,
-    effects: PhysicalEffects | None = None,
     machine: Machine | None = None,
 ) -> Compensator:
     """Put guard, limit and fixed point around a trained network, and the identified machine beside it.
@@ -152,17 +148,15 @@ def fit_compensator(
         network: features -> standardised deviation, of one repeat.
         scaling: of that repeat, without the leading dimension.
         inputs: training inputs, commanded joints and then covariates, `s x (n + m)` [SI].
-        deviations: training deviations of what the network learned, `s x n` [SI]; with `geometry` or `effects` what
-            these leave. The mean of the deviations that fade out is the safe correction outside the domain.
+        deviations: training deviations of what the network learned, `s x n` [SI]; with a `machine` what it leaves.
+            Their mean is the safe correction outside the domain.
         joints, covariates: coordinates in the order of the inputs.
         limit: hard limit of |δ|, `n` [SI], with a `machine` of what was learned; 1.5 times the largest training
-            deviation of each joint, geometry included, when None.
+            deviation of each joint when None.
         margin: how far beyond the training inputs δ is trusted, as a share of their half range.
         transition: width over which it then fades into the safe correction, as a share of the half range.
         sd_scale: what the network's standard deviation is multiplied by, `n` [1]; 1 when None.
-        geometry: deviation of the identified geometry, of one repeat.
-        effects: deviation of known effects, of one repeat.
-        machine: the identified one, where it has closed forms; in the place of the two.
+        machine: the identified one, of one repeat.
 
     Raises:
         InputError: shapes do not fit together, or a limit or a scale is out of its range.
@@ -175,30 +169,29 @@ def fit_compensator(
             f"{n} joints and {len(covariates)} covariates"
         )
     # Copies: what is compensated with does not change when the learner trains on.
-    frozen, geometry, effects, machine = copy.deepcopy((network, geometry, effects, machine))
+    frozen, machine = copy.deepcopy((network, machine))
     frozen.requires_grad_(False)
-    inputs, whole = inputs.detach(), _with_known(inputs, deviations, geometry, effects)
+    inputs, deviations = inputs.detach(), deviations.detach()
     if machine is not None:
         machine.ends = _of_other_days(covariates, inputs[:, n:]) | machine.ends
-    limit = default_limit(whole) if limit is None else limit.detach()
+    limit = default_limit(deviations) if limit is None else limit.detach()
     if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
         raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
     sd_scale = torch.ones_like(limit) if sd_scale is None else sd_scale.detach().clone()
     if sd_scale.shape != (n,) or not bool((sd_scale > 0).all() & torch.isfinite(sd_scale).all()):
         raise InputError(f"sd_scale must be one finite number above 0 for each of the {n} joints")
-    safe = torch.minimum(torch.maximum(whole.mean(0), -limit), limit)
-    safe_sd = (whole - safe).square().mean(0).sqrt()
+    safe = torch.minimum(torch.maximum(deviations.mean(0), -limit), limit)
+    safe_sd = (deviations - safe).square().mean(0).sqrt()
     reach = torch.cat([limit, limit.new_zeros(len(covariates))])
     domain = Domain.fit(inputs, reach, margin, transition)
-    alone = geometry is None and effects is None and machine is None
-    size = {} if alone else {"count": 512, "at_once": 1024}
+    size = {} if machine is None else {"count": 512, "at_once": 1024}
     share = 1.0
     for _ in range(_DAMPINGS):
         scaled = copy.deepcopy(scaling)
         scaled.deviation.mul_(share)
         compensator = Compensator(
             *(frozen, scaled, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale / share, safe_sd),
-            *(geometry, effects, False, machine),
+            *(False, machine),
         )
         slope = compensator.deviation if machine is None else compensator.learned
         found = steepest(slope, inputs, domain, limit, **size) if bool(limit.any()) else Steepness(0.0, 0.0)
@@ -220,19 +213,6 @@ def fit_compensator(
         f"{STEEPEST_DEVIATION:g} the command cannot be solved for safely; train with more rows, fewer nodes or "
         "regularisation, and leave out rows near singular poses (max_condition)"
     )
-
-
-@torch.no_grad()
-def _with_known(
-    inputs: Tensor, deviations: Tensor, geometry: ChebyshevExpansion | None, effects: PhysicalEffects | None
-) -> Tensor:
-    """Training deviations that the effects and the geometry left, and theirs; `s x n` [SI]."""
-    n = deviations.shape[-1]
-    if effects is not None:
-        deviations = deviations + effects(inputs[:, :n] + deviations, inputs[:, n:])
-    if geometry is not None:
-        deviations = deviations + geometry(inputs[:, :n] + deviations)
-    return deviations.detach()
 
 
 @torch.no_grad()
@@ -347,59 +327,9 @@ def _begun(compensator: Compensator, inputs: Tensor, most: int) -> tuple[Functio
     return functions, functions.run(start[: start.index("step") + 1], functions.start(inputs))
 
 
-# How much larger than at the rows what effects take from the kinematics may become.
-_ABOVE = 1.1
 ROWS = 2500
 """Rows that show where the machine is used."""
 _FEWEST = 100
-
-
-def machine_parts(
-    rows: Situation, acting: Sequence[Acting], values: Tensor, covariates: Sequence[str], margin: float
-) -> dict[str, Any]:
-    """Geometry and effects as `fit_compensator` takes them: a machine, or polynomials where it has no closed form.
-
-    Args:
-        rows: on the nominal machine, frames fitted, `s x n`; its region is what they fill.
-        acting: effects on joints and pose.
-        values: all parameters as identified, `k` [SI].
-        covariates: names of the compensator's, in order.
-        margin: of the compensator's domain.
-
-    Raises:
-        InputError, MethodFailedError: what effects see of the machine, or its geometry, is no polynomial of the joints.
-    """
-    mechanism = rows.mechanism
-    closed = closed_form_of(mechanism) is not None
-    effects = expand_effects(rows, acting, covariates, margin, None if closed else _care(rows)) if acting else None
-    machine = build_machine(mechanism, values, effects, rows.joints, margin)
-    if machine is not None:
-        return {"machine": machine}
-    geometry = None
-    if not torch.equal(values, mechanism.nominal):
-        geometry = expand(geometric_deviation(mechanism, mechanism.nominal, values), rows.joints, margin)
-    return {"geometry": geometry, "effects": effects}
-
-
-def geometric_deviation(mechanism: Mechanism, nominal: Tensor, identified: Tensor) -> Callable[[Tensor], Tensor]:
-    """The exact γ of one or many pairs of geometries.
-
-    Args:
-        nominal, identified: all parameters, `... x k` [SI], leading dims as the joints' to come.
-    """
-
-    def exact(joints: Tensor) -> Tensor:
-        pose = mechanism.forward_kinematics(joints, identified)
-        return mechanism.wrap(mechanism.solve_inverse(pose, nominal, joints) - joints)
-
-    return exact
-
-
-def _care(rows: Situation) -> Care:
-    """Near singular poses effects of a machine without closed forms grow no further than at the rows."""
-    care = Care(ROTATION_WEIGHT, 0.0)
-    gain, inverse_gain = (_ABOVE * float(sizes.max()) for sizes in gains(rows.jacobian, care))
-    return care._replace(gain=gain, inverse_gain=inverse_gain)
 
 
 def all_over(nominal: Mechanism) -> Situation:
@@ -433,7 +363,7 @@ def machine_alone(
         margin: by how much the domain is larger than what the rows fill.
 
     Raises:
-        InputError, MethodFailedError: see `machine_parts`, or few of the rows are poses.
+        InputError, MethodFailedError: see `machine_of`, or few of the rows are poses.
     """
     nominal, names = rows.mechanism, [c.name for c in covariates]
     there = torch.isfinite(nominal.forward_kinematics(rows.joints)).all(-1) & torch.isfinite(rows.joints).all(-1)
@@ -448,5 +378,5 @@ def machine_alone(
     weights = torch.ones(1, len(still), dtype=torch.float64)
     scaling = Scaling.fit(inputs[None], still[None], weights, turning).repeat(0)
     network = ConstantNetwork(still[0], still[0])
-    parts = machine_parts(fine, acting, values, names, margin)
-    return fit_compensator(network, scaling, inputs, still, nominal.joints, covariates, margin=margin, **parts)
+    machine = machine_of(fine, acting, values, names, margin)
+    return fit_compensator(network, scaling, inputs, still, nominal.joints, covariates, margin=margin, machine=machine)

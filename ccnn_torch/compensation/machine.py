@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from ccnn_torch.compensation.effects import PhysicalEffects
-from ccnn_torch.compensation.expansions import ChebyshevExpansion, expand
-from ccnn_torch.compensation.kinematics import (
-    ClosedKinematics,
-    Links,
-    Placed,
-    gauss_jordan,
-    inverse,
-)
-from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, mechanism_from_description
-from ccnn_torch.mechanisms.machines.links import compose, transform_of
+from ccnn_torch.compensation.kinematics import ClosedKinematics, Links, Placed, gauss_jordan, inverse
+from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
 from ccnn_torch.numerics.rotations import vee
 
 # Keeps what is inverted regular in the middle of a singular pose: of what shows how near it is, and of a step [m²].
@@ -31,9 +24,6 @@ SETTLED = 1e-9
 ASTRAY = 1e-3
 # Joints beyond it are none: what their sines and cosines are differs from library to library [m or rad].
 FARTHEST = 1e3
-_MOST_NEWTON = 8
-# Error of the polynomial from which Newton's method comes to the right pose, as a share of the largest.
-_START = 0.1
 
 
 class Rule(NamedTuple):
@@ -62,14 +52,13 @@ class Machine(nn.Module):
     """The identified machine, and the commands at which it reaches the nominal pose of ideal joints.
 
     f(q, c) = P(F(q + e_joints(q, c); θ), c), and the joints that minimise |W (f(c) - X)|² + λ² |c - q|² for the
-    nominal pose X of ideal joints q; of serial arms and of others whose forward kinematics is a closed form.
+    nominal pose X of ideal joints q.
 
     λ is fixed at q: 0 where no singular pose is near, so that the machine reaches X; the deviation is damped, not the
-    step, so that the command does not depend on the number of steps. Every step is Gauss and Newton's with the
-    identified Jacobian.
+    step, so that the command does not depend on the number of steps. Every step is Gauss and Newton's.
 
     Attributes:
-        mechanism: with the nominal parameters, fitted frames included.
+        kind: in model files.
         identified: all parameters as they were identified, `k` [SI].
         effects: on joints and pose; None without any.
         rule: of commands near singular poses.
@@ -79,61 +68,72 @@ class Machine(nn.Module):
         export_tolerance: share of the largest deviation to which exports agree: lengths near 1 m are rounded.
     """
 
-    kind = "forward"
+    kind = ""
     export_tolerance = 1e-9
     identified: Tensor
     low: Tensor
     high: Tensor
 
     def __init__(
-        self, mechanism: Mechanism, identified: Tensor, effects: PhysicalEffects | None = None, rule: Rule = RULE
+        self, identified: Tensor, low: Tensor, high: Tensor, effects: PhysicalEffects | None, rule: Rule
     ) -> None:
         super().__init__()
-        # In a tuple, since the mechanism's own buffers are no part of the model.
-        self._mechanism = (mechanism,)
         self.rule, self.effects = rule, effects
         self.ends: dict[str, tuple[float, float]] = {}
         self.register_buffer("identified", identified.detach().clone(), persistent=False)
-        low, high = limits_of(mechanism)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
-        self._prepare()
 
-    @property
-    def mechanism(self) -> Mechanism:
-        """The nominal machine."""
-        return self._mechanism[0]
+    @abstractmethod
+    def nominal_at(self, joints: Tensor) -> Placed:
+        """Where the nominal machine is at joints `... x n` [SI]."""
 
-    @property
-    def real(self) -> Mechanism:
-        """The machine with the identified parameters as its nominal ones."""
-        return self.mechanism.with_nominal(self.identified)
+    @abstractmethod
+    def identified_at(self, joints: Tensor) -> Placed:
+        """Where the identified machine is, without effects, at joints `... x n` [SI]."""
+
+    @abstractmethod
+    def description(self) -> dict[str, Any]:
+        """What `made` takes beside identified parameters, effects and rule; the tensors are stored beside it."""
+
+    @classmethod
+    @abstractmethod
+    def made(
+        cls, description: dict[str, Any], identified: Tensor, effects: PhysicalEffects | None, rule: Rule
+    ) -> Machine:
+        """The machine as it was described, its tensors without meaning."""
+
+    def known(self, joints: Tensor) -> Tensor:
+        """The nearest joints at which the kinematics are known, `... x n` [SI]; all of them are by default."""
+        return joints
 
     def aim(self, joints: Tensor) -> Tensor:
         """What a command is to reach, for ideal joints `... x n` [SI]: pose and λ² side by side, `... x a`."""
-        return self._aim(self._nominal.at(joints), self._identified.at(joints))
+        at = self.known(joints)
+        return self._aim(self.nominal_at(at), self.identified_at(at))
 
-    def aim_back(self, moved: Tensor, covariates: Tensor) -> Tensor:
-        """The same for the way back: the pose that the machine has; moved: command and what was learned there."""
-        return self._aim(self.reached(moved, covariates), self._nominal.at(moved), _BACK)
+    def aim_back(self, command: Tensor, learned: Tensor, covariates: Tensor) -> Tensor:
+        """The same for the way back: the pose that the machine has; learned: at the command, `... x n` [SI]."""
+        moved = self.known(command) + learned
+        return self._aim(self.reached(moved, covariates), self.nominal_at(moved), _BACK)
 
     def next_correction(
-        self, moved: Tensor, covariates: Tensor, ideal: Tensor, correction: Tensor, aim: Tensor
+        self, learned: Tensor, covariates: Tensor, ideal: Tensor, correction: Tensor, aim: Tensor
     ) -> Tensor:
         """What to subtract from the ideal joints next.
 
         Args:
-            moved: command and what was learned there, `... x n` [SI].
+            learned: at the command, `... x n` [SI].
             covariates: `... x m` [SI].
             ideal: joints, `... x n` [SI].
             correction: ideal joints less command, `... x n` [SI].
             aim: of the ideal joints.
         """
-        return self._step(self.reached(moved, covariates), correction, aim)
+        return self._step(self.reached(self.known(ideal) - correction + learned, covariates), correction, aim)
 
-    def next_back(self, joints: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
-        """The same for the way back: what to subtract from the command; joints: ideal ones, tried."""
-        return self._step(self._nominal.at(joints), correction, aim)
+    def next_back(self, command: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
+        """The same for the way back: what to subtract from the command, `... x n` [SI]."""
+        return self._step(self.nominal_at(self.known(command) - correction), correction, aim)
 
     def within(self, ideal: Tensor, correction: Tensor, most: Tensor) -> Tensor:
         """A correction of at most `most`, `n`, that takes no joint farther beyond its limits than it is; all [SI]."""
@@ -146,40 +146,28 @@ class Machine(nn.Module):
         """Everything `from_description` needs; the tensors are stored beside it."""
         return {
             "kind": self.kind,
-            "mechanism": self.mechanism.describe(),
             "identified": self.identified.tolist(),
             "effects": None if self.effects is None else self.effects.describe(),
             "rule": self.rule._asdict(),
+            **self.description(),
             **({"ends": {name: list(pair) for name, pair in self.ends.items()}} if self.ends else {}),
         }
 
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> Machine:
         """The machine as it was described, but for its tensors."""
-        # The reader of the file that contains this decides whether code may run.
-        mechanism = mechanism_from_description(description["mechanism"], allow_code=True)
         effects = None if description["effects"] is None else PhysicalEffects.from_description(description["effects"])
         identified = torch.tensor(description["identified"], dtype=torch.float64)
-        more = cls._blank(mechanism, description)
-        made = cls(mechanism, identified, effects, Rule(**description["rule"]), **more)
+        made = cls.made(description, identified, effects, Rule(**description["rule"]))
         made.ends = {name: (low, high) for name, (low, high) in description.get("ends", {}).items()}
         return made
-
-    @classmethod
-    def _blank(cls, mechanism: Mechanism, description: dict[str, Any]) -> dict[str, Any]:
-        """What else it is made of, tensors without meaning."""
-        return {}
-
-    def _prepare(self) -> None:
-        make = Links if isinstance(self.mechanism, SerialArm) else ClosedKinematics
-        self._nominal, self._identified = make(self.mechanism), make(self.real)
 
     def reached(self, moved: Tensor, covariates: Tensor) -> Placed:
         """Where the real machine is at command and what was learned there `... x n`, and covariates `... x m` [SI]."""
         if self.effects is None:
-            return self._identified.at(moved)
+            return self.identified_at(moved)
         joints, shift = self.effects.changes(moved, covariates)
-        placed = self._identified.at(moved if joints is None else moved + joints)
+        placed = self.identified_at(moved if joints is None else moved + joints)
         return placed if shift is None else placed.shifted(shift)
 
     def _aim(self, wanted: Placed, moving: Placed, share: float = 1.0) -> Tensor:
@@ -227,6 +215,60 @@ class Machine(nn.Module):
         return correction - step.squeeze(-1)
 
 
+class ForwardMachine(Machine):
+    """Of a serial arm, and of another whose forward kinematics is a closed form.
+
+    Attributes:
+        mechanism: with the nominal parameters, fitted frames included.
+    """
+
+    kind = "forward"
+
+    def __init__(
+        self, mechanism: Mechanism, identified: Tensor, effects: PhysicalEffects | None = None, rule: Rule = RULE
+    ) -> None:
+        super().__init__(identified, *limits_of(mechanism), effects, rule)
+        # In a tuple, since the mechanism's own buffers are no part of the model.
+        self._mechanism = (mechanism,)
+        self._prepare()
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The nominal machine."""
+        return self._mechanism[0]
+
+    @property
+    def real(self) -> Mechanism:
+        """The machine with the identified parameters as its nominal ones."""
+        return self.mechanism.with_nominal(self.identified)
+
+    def nominal_at(self, joints: Tensor) -> Placed:
+        return self._nominal.at(joints)
+
+    def identified_at(self, joints: Tensor) -> Placed:
+        return self._identified.at(joints)
+
+    def description(self) -> dict[str, Any]:
+        return {"mechanism": self.mechanism.describe()}
+
+    @classmethod
+    def made(
+        cls, description: dict[str, Any], identified: Tensor, effects: PhysicalEffects | None, rule: Rule
+    ) -> ForwardMachine:
+        # The reader of the file that contains this decides whether code may run.
+        mechanism = mechanism_from_description(description["mechanism"], allow_code=True)
+        return cls(mechanism, identified, effects, rule, **cls._blank(mechanism, description))
+
+    @classmethod
+    def _blank(cls, mechanism: Mechanism, description: dict[str, Any]) -> dict[str, Any]:
+        """What else it is made of, tensors without meaning."""
+        return {}
+
+    def _prepare(self) -> None:
+        make = Links if isinstance(self.mechanism, SerialArm) else ClosedKinematics
+        self._nominal, self._identified = make(self.mechanism), make(self.real)
+
+
 def limits_of(mechanism: Mechanism) -> tuple[Tensor, Tensor]:
     """Lowest and highest joints of the machine's file, `n` each [SI]; infinite where there are none."""
     none = torch.full((len(mechanism.joints),), math.inf, dtype=torch.float64)
@@ -235,202 +277,3 @@ def limits_of(mechanism: Mechanism) -> tuple[Tensor, Tensor]:
     # Exactly a full turn is what a joint without limits is sampled over.
     free = (mechanism.limits.abs() == math.pi).all(-1)
     return torch.where(free, -none, mechanism.limits[:, 0]), torch.where(free, none, mechanism.limits[:, 1])
-
-
-def _inner(mechanism: Mechanism) -> Mechanism:
-    """The machine itself, without the frames that it is seen through."""
-    return mechanism.mechanism if isinstance(mechanism, Framed) else mechanism
-
-
-class Frames(nn.Module):
-    """What lies between the poses of a nominal and an identified machine whose frames differ a little.
-
-    Both machines are seen through base and tool frames B F(q) T. A pose that is wanted of the identified one is
-    F' = (B⁻¹ B')⁻¹ F (T' T⁻¹)⁻¹ of the machine inside.
-
-    Attributes:
-        inside: pose, frame and derivatives of the machine inside.
-    """
-
-    # Of Newton's method, from a pose that is off by what was identified.
-    _STEPS = 3
-
-    def __init__(self, mechanism: Framed, identified: Tensor, inside: ClosedKinematics) -> None:
-        super().__init__()
-        (base, _, tool), (real_base, _, real_tool) = mechanism.split(mechanism.nominal), mechanism.split(identified)
-        before, after = transform_of(real_base), transform_of(real_tool)
-        # Products of two rotations, row by row: rotation and shift.
-        self._out = compose(_backward(transform_of(base)), before), compose(after, _backward(transform_of(tool)))
-        self._in = _backward(self._out[0]), _backward(self._out[1])
-        self._turn, self._lever = before[0], after[1]
-        # In a tuple, since the polynomial is stored once.
-        self._inside = (inside,)
-
-    def into(self, pose: Tensor) -> Tensor:
-        """Pose coordinates `... x p` of the identified machine inside, where the nominal one would have these."""
-        return self._moved(pose, self._in)
-
-    def out_of(self, pose: Tensor) -> Tensor:
-        """The other way."""
-        return self._moved(pose, self._out)
-
-    def shift(self, pose: Tensor, seen: Tensor) -> Tensor:
-        """A small shift of the frame that is seen, `... x 6` [m, rad], as one of the machine inside, at its pose."""
-        turn, moved = (seen[..., k : k + 3] @ self._turn for k in (3, 0))
-        _, rotation = self._inside[0].frame(pose)
-        lever = (rotation @ self._lever.unsqueeze(-1)).squeeze(-1)
-        return torch.cat([moved - torch.linalg.cross(turn, lever, dim=-1), turn], -1)
-
-    def _moved(self, pose: Tensor, by: tuple[_Transform, _Transform]) -> Tensor:
-        inside, rows = self._inside[0], pose.reshape(-1, pose.shape[-1])
-        position, rotation = inside.frame(rows)
-        rotation, position = compose(compose(by[0], (rotation, position)), by[1])
-        for _ in range(self._STEPS):
-            place, turn = inside.frame(rows)
-            gap = torch.cat([position - place, vee(rotation @ turn.mT)], -1)
-            rows = rows + inside.coordinates(rows, gap)
-        return rows.reshape(pose.shape)
-
-
-_Transform = tuple[Tensor, Tensor]
-
-
-def _backward(by: _Transform) -> _Transform:
-    return by[0].mT, -(by[0].mT @ by[1])
-
-
-class InverseMachine(Machine):
-    """g(P⁻¹(X, c); θ) - e_joints: every step finds the joints that the identified machine has at the pose.
-
-    Poses X are those of the machine inside, where it is seen through frames.
-
-    Attributes:
-        start: polynomial from which Newton's method finds the nominal pose of ideal joints.
-        newton: how many steps it takes.
-    """
-
-    kind = "inverse"
-
-    def __init__(
-        self,
-        mechanism: Mechanism,
-        identified: Tensor,
-        effects: PhysicalEffects | None = None,
-        rule: Rule = RULE,
-        start: ChebyshevExpansion | None = None,
-        newton: int = _MOST_NEWTON,
-    ) -> None:
-        assert start is not None
-        super().__init__(mechanism, identified, effects, rule)
-        self.start = start
-        nominal, real = _inner(mechanism), _inner(self.real)
-        # In a tuple, since the polynomial is stored once.
-        self._closed = (ClosedKinematics(nominal, start), ClosedKinematics(real, start))
-        self._frames = Frames(mechanism, identified, self._closed[0]) if isinstance(mechanism, Framed) else None
-        self._solve, self._numbers = nominal.solve_inverse, (nominal.nominal, real.nominal)
-        self.newton = newton
-
-    def aim(self, joints: Tensor) -> Tensor:
-        """Pose coordinates `... x p` [SI], and 1 where the machine cannot take the pose."""
-        pose, there = self._closed[0].standing(joints, self.newton)
-        pose = pose if self._frames is None else self._frames.into(pose)
-        return self._flat_pose(pose, there, self._numbers[1])
-
-    def aim_back(self, moved: Tensor, covariates: Tensor) -> Tensor:
-        joints, shift = (None, None) if self.effects is None else self.effects.changes(moved, covariates)
-        pose, there = self._closed[1].standing(moved if joints is None else moved + joints, self.newton)
-        pose = pose if shift is None else pose + self._coordinates(pose, shift)
-        pose = pose if self._frames is None else self._frames.out_of(pose)
-        return self._flat_pose(pose, there, self._numbers[0])
-
-    def next_correction(
-        self, moved: Tensor, covariates: Tensor, ideal: Tensor, correction: Tensor, aim: Tensor
-    ) -> Tensor:
-        joints, shift = (None, None) if self.effects is None else self.effects.changes(moved, covariates)
-        pose = aim[..., :-1]
-        pose = pose if shift is None else pose - self._coordinates(pose, shift)
-        wanted = self._solve(pose, self._numbers[1])
-        # Command and what is added to it are the joints of the real machine.
-        added = moved - (ideal - correction)
-        found = ideal - wanted + (added if joints is None else added + joints)
-        return _where_there(found, aim)
-
-    def next_back(self, joints: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
-        found = joints + correction - self._solve(aim[..., :-1], self._numbers[0])
-        return _where_there(found, aim)
-
-    def describe(self) -> dict[str, Any]:
-        return super().describe() | {"degree": self.start.degree, "newton": self.newton}
-
-    @classmethod
-    def _blank(cls, mechanism: Mechanism, description: dict[str, Any]) -> dict[str, Any]:
-        unit = torch.ones(len(mechanism.joints), dtype=torch.float64)
-        polynomial = ChebyshevExpansion(unit, unit.clone(), description["degree"], outputs=len(_inner(mechanism).pose))
-        return {"start": polynomial, "newton": description["newton"]}
-
-    def _prepare(self) -> None:
-        pass
-
-    def _flat_pose(self, pose: Tensor, there: Tensor, values: Tensor) -> Tensor:
-        """Pose coordinates, and 0 where they are reached with these parameters, too, else 1."""
-        reached = torch.isfinite(self._solve(pose, values)).all(-1, keepdim=True)
-        return torch.cat([pose, torch.where(torch.logical_and(there, reached), 0.0, 1.0)], -1)
-
-    def _coordinates(self, pose: Tensor, shift: Tensor) -> Tensor:
-        """Pose coordinates `... x p` of a small shift `... x c` of the frame."""
-        rows = pose.reshape(-1, pose.shape[-1])
-        shift = shift.reshape(-1, shift.shape[-1])
-        shift = shift if self._frames is None else self._frames.shift(rows, shift)
-        found = self._closed[0].coordinates(rows, shift)
-        return found.reshape(pose.shape)
-
-
-def _where_there(found: Tensor, aim: Tensor) -> Tensor:
-    """A correction, 0 where the machine cannot take the pose."""
-    there = torch.where(aim[..., -1:] <= 0, found, torch.zeros_like(found))
-    return torch.where(torch.isfinite(found), there, torch.zeros_like(found))
-
-
-def closed_form_of(mechanism: Mechanism) -> str | None:
-    """Which direction of a machine a command can take: that of the machine inside, where it is seen through frames."""
-    if isinstance(mechanism, SerialArm):
-        return "forward"
-    if not isinstance(mechanism, Framed) or mechanism.grouped:
-        return mechanism.closed_form
-    inner = mechanism.mechanism
-    turns = inner.frame(inner.home_pose)[1] is not None
-    # Out of the plane, say, a frame may differ as no pose coordinate does.
-    fits = not turns if inner.closed_form == "forward" else len(inner.pose) == 6
-    return inner.closed_form if fits else None
-
-
-def build_machine(
-    mechanism: Mechanism,
-    identified: Tensor,
-    effects: PhysicalEffects | None,
-    joints: Tensor,
-    margin: float,
-    rule: Rule = RULE,
-) -> Machine | None:
-    """The machine of a compensator; None for one without a closed form in either direction.
-
-    Args:
-        mechanism: with the nominal parameters, fitted frames included.
-        identified: all parameters, `k` [SI].
-        effects: on joints and pose; None without any.
-        joints: commanded joints of the training rows, `s x n` [SI].
-        margin: of the compensator's domain.
-
-    Raises:
-        InputError, MethodFailedError: as `expand`.
-    """
-    way = closed_form_of(mechanism)
-    if way == "forward":
-        return Machine(mechanism, identified, effects, rule)
-    if way is None:
-        return None
-    inner = _inner(mechanism)
-    start = expand(lambda q: inner.forward_kinematics(q), joints, margin, "pose", worst=_START)
-    made = InverseMachine(mechanism, identified, effects, rule, start)
-    made.newton = max(one.steps_needed(joints, _MOST_NEWTON) for one in made._closed)
-    return made

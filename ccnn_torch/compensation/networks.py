@@ -15,10 +15,9 @@ _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "grnn": "ccnn_torch.learners.grnn_network:GRNNNetwork",
     "gp": "ccnn_torch.learners.gaussian_process:GPNetwork",
     "masked": "ccnn_torch.evolution.masked_network:MaskedNetwork",
-    "forward": "ccnn_torch.compensation.machine:Machine",
-    "inverse": "ccnn_torch.compensation.machine:InverseMachine",
-    "physical_effects": "ccnn_torch.compensation.effects:PhysicalEffects",
-    "expanded_geometry": "ccnn_torch.compensation.expansions:ChebyshevExpansion",
+    "forward": "ccnn_torch.compensation.machine:ForwardMachine",
+    "inverse": "ccnn_torch.compensation.inverse_machine:InverseMachine",
+    "expanded": "ccnn_torch.compensation.expanded_machine:ExpandedMachine",
 }
 
 

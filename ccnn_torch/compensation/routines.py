@@ -164,14 +164,13 @@ def status_of(strange: Tensor, inside: Tensor, doubt: Tensor | None = None) -> T
 
 
 class Learned(NamedTuple):
-    """δ as it was learned, `... x n` [SI]; the guard's excess and weight, `... x 1` [1] each; the network's features,
-    `... x i` [1]; and the inputs as the network takes them, `... x (n + m)` [SI]."""
+    """δ as it was learned, `... x n` [SI]; the guard's excess and weight, `... x 1` [1] each; and the network's
+    features, `... x i` [1]."""
 
     value: Tensor
     excess: Tensor
     weight: Tensor
     features: Tensor
-    caged: Tensor
 
 
 Variables = dict[str, Tensor]
@@ -194,7 +193,7 @@ class Functions:
         self.room = room or max(1, own.iterations - 1)
         # Without what is computed at the caged joints themselves, joints may be caged once, with room for a correction:
         # beyond the cage all deviations are the safe one.
-        self.caged_once = own.geometry is None and own.effects is None and own.machine is None
+        self.caged_once = own.machine is None
 
     def inputs_of(self, name: str) -> list[str]:
         """Variables that a function takes."""
@@ -253,35 +252,16 @@ class Functions:
         fade = torch.relu(1 - excess)
         weight = fade * fade
         value = self.faded(raw, weight)
-        return Learned(value, excess, weight, features, caged)
-
-    def known(self, weight: Tensor, caged: Tensor) -> Tensor:
-        """Weight of geometry and effects, `... x 1`: other temperatures and loads than measured do not end it."""
-        own, n = self.own, self.joints
-        if not own.covariates:
-            return weight
-        usual = own.domain.centre[n:].expand_as(caged[..., n:])
-        fade = torch.relu(1 - self.excess(torch.cat([caged[..., :n], usual], -1)))
-        return torch.maximum(weight, fade * fade)
+        return Learned(value, excess, weight, features)
 
     def step(self, q: Tensor, x: Tensor, correction: Tensor, aim: Tensor) -> Variables:
-        own, n = self.own, self.joints
-        found, excess, weight, features, caged = self.learned(q - correction, x)
+        own = self.own
+        found, excess, weight, features = self.learned(q - correction, x)
         doubt = torch.zeros_like(weight)
         if own.machine is not None:
-            wanted = own.machine.next_correction(q - correction + found, own.held(x), q, correction, aim)
+            wanted = own.machine.next_correction(found, own.held(x), q, correction, aim)
             bounded = own.machine.within(q, own.shortened(wanted), own.most)
             found, doubt = bounded, self._doubt(wanted, correction, aim)
-        if own.effects is not None or own.geometry is not None:
-            known = self.known(weight, caged)
-            # The safe correction is of the whole deviation.
-            found = found + (weight - known) * own.safe
-            if own.effects is not None:
-                found = found + known * own.effects(caged[..., :n] + found, own.held(caged[..., n:]))
-            if own.geometry is not None:
-                found = found + known * own.geometry(caged[..., :n] + found)
-            # The limit is that of the sum: either part may be larger than what both leave.
-            found = own.limited(found)
         return {"found": found, "excess": excess, "weight": weight, "features": features, "doubt": doubt}
 
     def following(self, found: Tensor, correction: Tensor, steps: Tensor) -> Variables:
@@ -320,13 +300,13 @@ class Functions:
         own = self.own
         assert own.machine is not None
         learned = self.learned(q, x)
-        aim = own.machine.aim_back(q + learned.value, own.held(x))
+        aim = own.machine.aim_back(q, learned.value, own.held(x))
         return {"aim": aim, "excess": learned.excess, "weight": learned.weight}
 
     def back(self, q: Tensor, correction: Tensor, aim: Tensor) -> Variables:
         own = self.own
         assert own.machine is not None
-        wanted = own.machine.next_back(q - correction, correction, aim)
+        wanted = own.machine.next_back(q, correction, aim)
         return {"found": own.shortened(wanted), "doubt": self._doubt(wanted, correction, aim)}
 
     def finish(

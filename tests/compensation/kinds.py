@@ -6,20 +6,12 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import torch
-from machines import MACHINES, compensated, known, near, overconstrained, small_network
+from machines import MACHINES, compensated, known, near
 from stand_ins import Sigmoids, arm_compensator, tripod_compensator, tripod_joints
 from test_learned_models import LEARNERS
 from torch import Tensor
 
-from ccnn_torch.compensation import (
-    Care,
-    Compensator,
-    build_machine,
-    expand,
-    expand_effects,
-    fit_compensator,
-    geometric_deviation,
-)
+from ccnn_torch.compensation import Compensator, build_machine, fit_compensator
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.evolution.masked_network import MaskedNetwork
 from ccnn_torch.evolution.waves import Harmonics, Waves
@@ -114,18 +106,6 @@ def little_arm() -> Compensator:
     return near(arm, 1e-4, joints).compensator()
 
 
-def expanded() -> Compensator:
-    """Identified geometry and effects of a machine without closed forms, as polynomials."""
-    made = overconstrained()
-    mechanism, joints = made.mechanism, made.joints
-    exact = geometric_deviation(mechanism, mechanism.nominal, made.identified)
-    geometry = expand(exact, joints)
-    situation = made.situation(joints, made.inputs[:, 2:])
-    effects = expand_effects(situation, made.acting, [], 0.1, Care(0.3, 1e-2, 3.0, 6.0))
-    network, scaling, deviations = small_network(joints, 2e-5)
-    return fit_compensator(network, scaling, joints, deviations, mechanism.joints, geometry=geometry, effects=effects)
-
-
 # Of these the others hold everything that a form has; to trace them again takes time.
 _EAGER_ALONE = ("arm", "arm with effects", "arm by positions", "five axes", "tripod")
 KINDS: dict[str, Callable[[], Compensator]] = {
@@ -134,7 +114,6 @@ KINDS: dict[str, Callable[[], Compensator]] = {
     "masked": masked,
     "steep": lambda: tripod_compensator(gain=2.0, size=2e-2),
     "six joints": six_joints,
-    "polynomials": expanded,
     **{name: (lambda name=name: compensated(name)) for name in MACHINES if name not in _EAGER_ALONE},
     **{name: (lambda name=name: learned(name)) for name in LEARNERS},
 }

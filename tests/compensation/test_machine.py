@@ -30,8 +30,10 @@ from stand_ins import fields
 from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, Solution, load_model, save_model
+from ccnn_torch.compensation.expanded_machine import ExpandedMachine
 from ccnn_torch.compensation.fit import all_over, machine_alone
-from ccnn_torch.compensation.machine import SETTLED, InverseMachine, Machine, limits_of
+from ccnn_torch.compensation.inverse_machine import InverseMachine
+from ccnn_torch.compensation.machine import SETTLED, Machine, limits_of
 from ccnn_torch.compensation.targets.from_model import form_of
 from ccnn_torch.compensation.targets.golden import probe_points, run_form
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
@@ -46,6 +48,8 @@ CLOSEST = ("scara", "five axes")
 # More joints than coordinates: many ways back.
 MANY = ("arm by positions", "seven joints")
 OTHERS = [name for name in MACHINES if name not in CLOSEST]
+# What the slope of a polynomial leaves of a deviation of a millimetre, and turns of `frame` that two joints cannot do.
+EXPANDED = {"polynomials": 3e-7}
 
 
 def points(made: Compensator, reach: float = 1.0, count: int = 200, seed: int = 7) -> tuple[Tensor, Tensor]:
@@ -89,7 +93,7 @@ def test_where_the_status_is_0_the_true_machine_reaches_the_nominal_pose(name: s
     left = apart(reached(machine, made, found.command, covariates), frame)[exact]
     before = apart(machine.frame(joints, covariates), frame)[exact]
     assert int(exact.sum()) > 30
-    assert float(left.max()) < TOLERANCE < 1e-3 * float(before.median())
+    assert float(left.max()) < EXPANDED.get(name, TOLERANCE) < 1e-3 * float(before.median())
     torch.testing.assert_close(found.command + found.deviation, joints, rtol=0, atol=1e-14)
     assert bool((found.deviation.abs() <= made.most).all())
 
@@ -281,6 +285,21 @@ def test_outside_of_what_was_measured_physics_stays_and_what_was_learned_fades(n
     assert torch.equal(learned, made.safe.expand_as(learned))
 
 
+def test_polynomials_are_held_where_they_end() -> None:
+    """Beyond their box the correction is that at its edge, there and back."""
+    machine, made = known("polynomials"), compensated("polynomials")
+    assert isinstance(made.machine, ExpandedMachine)
+    far = made.domain.centre + torch.tensor([[30.0, 0.0], [0.0, -30.0], [30.0, 30.0]], dtype=torch.float64)
+    found, edge = solved(made, far), made.machine.known(far)
+    at_edge = solved(made, edge)
+    assert found.status.tolist() == [OUTSIDE] * 3
+    assert float((found.deviation - at_edge.deviation).abs().max()) < 3 * float(made.limit.max())
+    torch.testing.assert_close(solved(made, found.command).ideal, far, rtol=0, atol=3 * float(made.limit.max()))
+    left = apart(reached(machine, made, at_edge.command, far[:, :0]), wanted(machine, edge))
+    before = apart(machine.frame(edge, far[:, :0]), wanted(machine, edge))
+    assert float((left / before).max()) < 0.02
+
+
 def test_covariates_are_held_at_ends_by_what_was_measured() -> None:
     name = "sliding arm with effects"
     machine, made = known(name), compensated(name)
@@ -358,7 +377,7 @@ def test_limits_of_a_urdf_are_kept_and_said() -> None:
 STRANGE = [NAN, INF, -INF, 1e300, -1e308, 1.01e3, -5e3, 1e155]
 
 
-@pytest.mark.parametrize("name", ["sliding arm with effects", "tripod", "delta"])
+@pytest.mark.parametrize("name", ["sliding arm with effects", "tripod", "delta", "polynomials"])
 @pytest.mark.parametrize("value", STRANGE)
 def test_inputs_that_are_none_are_commanded_as_they_are(name: str, value: float) -> None:
     made = compensated(name)
@@ -377,7 +396,7 @@ def test_inputs_that_are_none_are_commanded_as_they_are(name: str, value: float)
         assert (solved(made, strange[:, :n], strange[:, n:]).status == NOT_FINITE).all()
 
 
-@pytest.mark.parametrize("name", ["sliding arm with effects", "framed stewart with effects"])
+@pytest.mark.parametrize("name", ["sliding arm with effects", "framed stewart with effects", "polynomials"])
 def test_every_form_gives_the_same_commands(name: str, tmp_path: Path) -> None:
     made, mechanism = compensated(name), known(name).mechanism
     about = fields() | {"mechanism": mechanism.describe()}
@@ -443,6 +462,7 @@ def test_which_machine_is_inverted_and_which_is_none() -> None:
     for name in MACHINES:
         inverse = "stewart" in name or "tripod" in name
         assert isinstance(compensated(name).machine, InverseMachine) == inverse
+        assert isinstance(compensated(name).machine, ExpandedMachine) == (name in EXPANDED)
     assert isinstance(known("arm").mechanism, SerialArm)
     assert load_mechanism("overconstrained_2dof").closed_form is None
 

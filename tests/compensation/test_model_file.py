@@ -299,7 +299,7 @@ def test_a_file_of_an_earlier_version_says_what_to_do(copied: Path) -> None:
     with safe_open(path, framework="pt") as file:
         text = file.metadata()["ccnn_torch"]
     for version in (1, 6, 60):
-        older = text.replace("ccnn_torch compensator 7", f"ccnn_torch compensator {version}")
+        older = text.replace("ccnn_torch compensator 8", f"ccnn_torch compensator {version}")
         save_file(load_file(path), path, metadata={"ccnn_torch": older})
         vouch(path)
         with pytest.raises(ModelFileError, match=rf"compensator {version}' of another version.*write it again"):

@@ -30,7 +30,7 @@ from ccnn_torch.errors import InputError, ModelFileError, raise_if_out_of_memory
 from ccnn_torch.training import Scaling, tensor_digest
 from ccnn_torch.version import __version__
 
-OPTIONAL = ("secant", "geometry", "effects", "machine")
+OPTIONAL = ("secant", "machine")
 """Keys of parts that not every model has."""
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
 _PACKAGES = ("torch", "onnx", "onnxruntime", "safetensors", "numpy")
@@ -140,8 +140,6 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
         facts["iterations"],
         tensors["sd_scale"],
         tensors["safe_sd"],
-        made("geometry"),
-        made("effects"),
         facts.get("secant", False),
         made("machine"),
         tensors["most"],

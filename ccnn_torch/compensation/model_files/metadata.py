@@ -93,7 +93,7 @@ def run_onnx(session: onnxruntime.InferenceSession, joints: Array, covariates: A
     return dict(zip(names, session.run(names, feeds), strict=True))
 
 
-FORMAT = f"{_FORMATS}7"
+FORMAT = f"{_FORMATS}8"
 
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -152,6 +152,8 @@ class Acting(_Form):
 class Closed(_Form):
     degree: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
     newton: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
+    joints: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
+    degrees: list[Annotated[int, Field(ge=0, le=_MOST_TERMS)]] = []
     ends: dict[str, Annotated[list[_Number], Field(min_length=2, max_length=2)]] = {}
     effects: Acting | None = None
 
@@ -162,8 +164,6 @@ class Facts(_Form):
     covariates: list[Axis]
     pose: list[Axis]
     network: dict[str, Any]
-    geometry: dict[str, Any] = {}
-    effects: Acting | None = None
     machine: Closed = Closed()
     domain: Inside
     limits: dict[str, Limit]

@@ -232,8 +232,6 @@ def _hard(compensator: Compensator) -> str:
     step, limit = float(np.finfo("float32").eps), float(compensator.limit.max())
     if compensator.machine is not None:
         return f"it computes the machine's kinematics: 1 m is rounded to {step:.1g} m, and the limit is {limit:.1g}"
-    if compensator.effects is not None:
-        return "its physical effects are polynomials of many terms, which cancel"
     if getattr(compensator.network, "export_tolerance", TOLERANCE) > TOLERANCE:
         return "its network is a sum of many terms, which cancel"
     return f"a joint of 1 m or rad is rounded to {step:.1g}, and the limit is {limit:.1g}"

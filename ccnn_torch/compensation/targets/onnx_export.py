@@ -239,12 +239,11 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     ideal = joints + `back_deviation`. `guard` and `back_guard` are 1 inside the domain and fall to 0 outside.
 
     Raises:
-        MethodFailedError: the file is not right to 1e-5 of the limit, or the model holds physical effects or identified
-            kinematics, which are computed in double: a length of 1 m is rounded by as much as a deviation.
+        MethodFailedError: the file is not right to 1e-5 of the limit, or the model holds an identified machine,
+            which is computed in double: a length of 1 m is rounded by as much as a deviation.
     """
-    if compensator.effects is not None or compensator.machine is not None:
-        what = "identified kinematics" if compensator.effects is None else "physical effects"
-        raise MethodFailedError(f"the {what} need double precision; use the float64 file")
+    if compensator.machine is not None:
+        raise MethodFailedError("the identified kinematics need double precision; use the float64 file")
     twin = copy.copy(compensator)
     if not twin.secant:
         twin.iterations = single_steps(compensator)
@@ -281,7 +280,7 @@ def verify(compensator: Compensator, run: Any, form: str, outputs: Sequence[str]
     Raises:
         MethodFailedError: it differs by more than 1e-12 of the limit (commands: and the rounding of a joint; standard
             deviations: and 1e-12 of themselves). A network may ask for more than 1e-12, up to 1e-9, by its attribute
-            `export_tolerance`; so may geometry, effects and machine.
+            `export_tolerance`; so may a machine.
     """
     joints, covariates = probe_points(compensator)
     with torch.no_grad():
