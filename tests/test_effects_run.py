@@ -25,7 +25,7 @@ from ccnn_torch.cli.application import app
 from ccnn_torch.compensation import PhysicalEffects, expand_effects, load_model
 from ccnn_torch.compensation.model_files.metadata import open_onnx
 from ccnn_torch.diagnosis.from_file import Verdict, read_verdict
-from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, measured_pose, reached
+from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect
 from ccnn_torch.effects.covariates import draw_covariates
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
