@@ -115,6 +115,32 @@ def test_drives_that_the_file_tells_are_looked_for_there_whatever_their_period()
     assert miss(fitted(situation, pose)[1], acting) > 1.5 * miss(found, acting)
 
 
+def test_many_causes_are_not_the_noise_of_a_search_for_one_more() -> None:
+    """The noise of the rows is estimated beside all that is there: beside a few causes a wave passed for one more."""
+    generator = torch.Generator().manual_seed(12)
+    bar = load_mechanism("five_bar", gears=[50, 50])
+    joints, ramp = bar.sample_joints(60, generator), torch.linspace(290.15, 298.15, 60, dtype=torch.float64)
+    covariates = {"temperature": ramp, "load_y": -20 + 10 * torch.rand(60, generator=generator, dtype=torch.float64)}
+    for i in (1, 2):
+        covariates[f"direction{i}"] = torch.randn(60, generator=generator, dtype=torch.float64).sign()
+    situation = Situation(bar, joints, covariates, default_gravity(bar))
+    acting = []
+    for name, share, period in (
+        *(("transmission", 0.05, 1.0), ("transmission", 0.5, 50.0), ("thermal", 0.5, 0.0)),
+        *(("backlash", 0.3, 0.0), ("compliance", 0.3, 0.0), ("joint_gain", 0.3, 0.0)),
+    ):
+        effect = make_effect(name)
+        sizes = [0.0 if c.secondary else share * c.scale for c in effect.coefficients(situation)]
+        shape = [period or s.usual or s.grid[len(s.grid) // 2] for s in effect.shapes(situation)]
+        acting.append(Acting(effect, *(torch.tensor(v, dtype=torch.float64) for v in (shape, sizes))))
+    true = bar.nominal + 2e-4 * torch.randn(len(bar.nominal), generator=generator, dtype=torch.float64)
+    noise = 3e-6 * torch.randn(60, 2, generator=generator, dtype=torch.float64)
+    pose = reached(situation, acting, true)[:, :2] + noise
+    library = [make_effect(name) for name in (*LIBRARY, "compliance", "thermal", "backlash", "friction")]
+    known = effects_that_pay(situation, pose, library, torch.ones(60) > 0, range(len(true)))
+    assert [k.shape.tolist() for k in known if k.effect.name == "transmission"] == [[50.0, 50.0]]
+
+
 def test_parameters_that_are_not_loose_stay() -> None:
     situation = rows(60, 1)
     pose = measured(situation, [], NOISE)

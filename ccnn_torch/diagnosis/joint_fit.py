@@ -39,6 +39,8 @@ _STEPS, _DAMPING, _LAST = 12, 1e-8, 0.1
 # Standard deviation of a frame's coordinate where the rows leave it open, in plausible errors, and the share of the
 # largest below which they leave a direction open.
 _ANYWHERE, _OPEN = 1e2, 1e-9
+# Estimates of the noise before shapes are searched.
+_RENEWALS = 2
 # Periods that are looked for of an effect that may have any, beside once a turn, which needs no search: a gear train
 # errs with more than one.
 _TIMES = 2
@@ -80,7 +82,7 @@ def fit_jointly(
         fit = fit_sets(rows.grams(white), [rows.groups], 0.0)
         before, (at, rows) = rows, _most_probable(rows, at, white, fit, measured)
         change, left = (white(v).norm() for v in (rows.left - before.left, rows.left))
-        white = rows.renewed(white, fit, at)
+        white = rows.renewed(white, fit, rows.left)
         if float(change) <= _SETTLED * float(left):
             break
     return JointFit(model.acting(at), model.parameters(at))
@@ -144,6 +146,8 @@ def effects_that_pay(
     model = _Model(situation, [*settled, *searched], loose)
     rows = model.about(model.begin(start), measured, usable)
     white = rows.whitening()
+    for _ in range(_RENEWALS):
+        white = rows.renewed(white, *_left_by_all(rows, white))
     scans: dict[str, Scan] = {}
     for i, one in enumerate(searched, len(settled)):
         scan = scans.get(one.effect.name) or Scan(situation, rows.there, one.effect, white)
@@ -316,16 +320,16 @@ class _Rows:
             self.target, columns, channels, None, self.fine, self.seen, device_axes(here), here.mechanism.channels
         )
         # A plate that stands elsewhere than it was thought makes no outliers of its rows.
-        left = white.picked(self._without_frames(white, self.left[..., None])[0][..., 0]) / white.sigma
+        left = white.picked(self.without_frames(white, self.left[..., None])[0][..., 0]) / white.sigma
         near = inlying(left.norm(dim=-1), self.fine, len(white.channels), 0)
         return replace(white, weight=(self.fine & near)[:, None].expand_as(left).to(left.dtype))
 
     def grams(self, white: Whitening) -> Grams:
         """Inner products of what the frames cannot do."""
-        every, seen = self._without_frames(white, torch.cat([self.columns, self.target[..., None]], -1))
+        every, seen = self.without_frames(white, torch.cat([self.columns, self.target[..., None]], -1))
         return grams_of(white(every[..., :-1]), white(every[..., -1]))._replace(values=white.count() - seen)
 
-    def _without_frames(self, white: Whitening, values: Tensor) -> tuple[Tensor, int]:
+    def without_frames(self, white: Whitening, values: Tensor) -> tuple[Tensor, int]:
         """Values `s x c x m` less what the frames can make of them, and how many of these the rows show."""
         placed = self.columns[..., self.frames]
         if not placed.shape[-1]:
@@ -334,13 +338,12 @@ class _Rows:
         found = torch.linalg.lstsq(*within, rcond=_OPEN, driver="gelsd")
         return values - placed @ found.solution, int(found.rank)
 
-    def renewed(self, white: Whitening, fit: Fits, at: Tensor) -> Whitening:
-        """Noise and weights from what a fit leaves."""
+    def renewed(self, white: Whitening, fit: Fits, left: Tensor) -> Whitening:
+        """Noise and weights from what a fit leaves, `s x c` [m, rad]."""
         values = max(white.count(), 1.0)
-        placed = self._without_frames(white, self.target[..., None])[1]
+        placed = self.without_frames(white, self.target[..., None])[1]
         free = 1 - (float(fit.effective[0]) + placed) / values
-        left = white.picked(self.target - self.columns @ at)
-        return renewed(white, left, white.picked(self.target), free, self.fine)
+        return renewed(white, white.picked(left), white.picked(self.target), free, self.fine)
 
     def with_shape(self, i: int, known: Known) -> _Rows:
         """The same with another shape of one of the effects, which does nothing yet."""
@@ -386,6 +389,14 @@ def _at_better_shape(rows: _Rows, i: int, scan: Scan) -> _Rows:
 
 def _fitted(rows: _Rows, white: Whitening) -> Fits:
     return fit_sets(rows.grams(white), [rows.groups], 0.0)
+
+
+def _left_by_all(rows: _Rows, white: Whitening) -> tuple[Fits, Tensor]:
+    """A fit of everything that is there, and what it leaves, `s x c` [m, rad]: less than the noise of `whitening`,
+    which adds causes one by one as long as each pays."""
+    fit, which = _fitted(rows, white), torch.cat([*rows.groups, rows.frames[:0]])
+    left = rows.target - rows.columns[..., which] @ fit.mean[0][: len(which)]
+    return fit, rows.without_frames(white, left[..., None])[0][..., 0]
 
 
 def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
