@@ -25,7 +25,7 @@ def commanded(
     command: str = "run",
     config: str = "mechanism: machine.yaml\n",
     file: str = "machine.yaml",
-    flags: tuple[str, ...] = (),
+    flags: str = "",
 ) -> Array | None:
     """Commands by the file that a calibration writes, `s x n` [SI]; None where there are none.
 
@@ -45,7 +45,7 @@ def commanded(
     contestant = Contestant(folder, command)
     contestant.call(command, "config.yaml", f"out={command}", "save_report=false")
     model = {"run": "model.safetensors", "identify": "identified.yaml"}[command]
-    contestant.call("compensate", f"{command}/{model}", "targets.csv", f"{command}.csv", *flags)
+    contestant.call("compensate", f"{command}/{model}", "targets.csv", f"{command}.csv", *flags.split())
     path, joints = folder / f"{command}.csv", sum(column.startswith("q") for column in targets[0].split(","))
     return read_commands(path, joints).joints if path.is_file() else None
 

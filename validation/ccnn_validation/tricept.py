@@ -53,7 +53,7 @@ class Head:
         on = {cause: float(cause not in without) for cause in CAUSES}
 
         def size(low: float, high: float, *shape: int) -> Array:
-            return rng.uniform(low, high, shape) * rng.choice([-1, 1], shape)
+            return np.asarray(rng.uniform(low, high, shape) * rng.choice([-1, 1], shape))
 
         self.base = BASE * RING + on["anchors"] * size(5e-5, 3e-4, 3, 3)
         self.platform = PLATFORM * RING + on["anchors"] * size(5e-5, 3e-4, 3, 3)
@@ -86,7 +86,7 @@ class Head:
         """Distances between the joints of each leg, `s x 3` [m], and height of the head's centre of mass, `s` [m]."""
         at, frame = self.place(state)
         ends = at[:, None] + self.platform @ frame.swapaxes(1, 2)
-        return np.linalg.norm(ends - self.base, axis=-1), (at + frame @ self.centre)[:, 2]
+        return np.asarray(np.linalg.norm(ends - self.base, axis=-1)), np.asarray((at + frame @ self.centre)[:, 2])
 
     def closed(self, lengths: Array) -> tuple[Array, Array]:
         """State in which the legs have these lengths, and the force that pulls each one [N], both `s x 3`."""
@@ -97,7 +97,7 @@ class Head:
             state = state + np.linalg.solve(slope, (lengths - self.spans(state)[0])[..., None])[..., 0]
         rise = np.stack([(up[1] - down[1]) / 2e-6 for up, down in ways], -1)
         pull = -self.mass * G * np.linalg.solve(slope.swapaxes(1, 2), rise[..., None])[..., 0]
-        return state, pull
+        return np.asarray(state), np.asarray(pull)
 
     def reached(self, joints: Array, told: Array) -> Array:
         """The reflector, `s x 3` [m]; `told`: temperatures of the legs [deg C], directions, `s x 6`."""
@@ -250,7 +250,7 @@ def judged(seed: int, rows: int, without: tuple[str, ...] = (), kept: Path | Non
         with TemporaryDirectory() as folder:
             place = Path(folder) if kept is None else kept / who.replace(" ", "_")
             place.mkdir(parents=True, exist_ok=True)
-            commands = commanded(place, text, *files, "run", config, "tricept_head.py", ("--allow-code",))
+            commands = commanded(place, text, *files, "run", config, "tricept_head.py", "--allow-code")
         sent[who] = np.full_like(wanted, np.nan) if commands is None else commands
     gone = {who: bool(np.isnan(q).any()) for who, q in sent.items()}
     found = {who: np.nan if gone[who] else missed(goal, frame, machine.reached(q, then)) for who, q in sent.items()}

@@ -74,4 +74,5 @@ class Tricept(Mechanism):
         pz = pz + apart[..., None]
         px, pz = torch.cos(a) * px + torch.sin(a) * pz, torch.cos(a) * pz - torch.sin(a) * px
         gaps = torch.stack([px, py, pz], -1) - legs[..., :3]
-        return torch.linalg.vector_norm(gaps, dim=-1) - joints - legs[..., 6]
+        lengths: Tensor = torch.linalg.vector_norm(gaps, dim=-1)
+        return lengths - joints - legs[..., 6]
