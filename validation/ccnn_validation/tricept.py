@@ -1,13 +1,14 @@
 """A head with three extensible legs and a central leg without a drive, which the package does not ship.
 
 `python -m ccnn_validation.tricept --seed N [--machines N] [--rows N]`. A laser tracker reads x, y, z of a reflector in
-the spindle, 8 µm of noise in each; beside them stand a thermometer on each leg and each leg's direction of approach.
-The true machine: joints of the legs elsewhere, zeros, screws of 10 mm lead whose error grows and returns each turn,
-legs that grow as they warm and stretch under the head's weight (softer when long), play, and a central joint whose axes
-neither meet nor are square. Ours (`ccnn run`, by the written file) has the user's own class `tricept_head.Tricept`;
-"and leads" also knows the screws' lead, "and centre" also has errors of the central joint as numbers. The plain SciPy
-script has the same geometry, zeros, leads and growth; "fuller script" also waves of the screws, play, and what the legs
-give. Judged in the frame and at the tool point that suit best; "a reading" is what a reading of the tracker is off.
+the spindle, 8 µm of noise in each; beside them stand a thermometer of the hall, one on each leg, and each leg's
+direction of approach. The true machine: joints of the legs elsewhere, zeros, screws of 10 mm lead whose error grows and
+returns each turn, legs that grow as they warm and stretch under the head's weight (softer when long), play, and a
+central joint whose axes neither meet nor are square. Ours (`ccnn run`, by the written file) has the user's own class
+`tricept_head.Tricept`; "leads" also knows the screws' lead, "no hall" has the thermometers of the legs alone, "mean"
+their mean in the place of the hall's, "one" their mean alone. The plain SciPy script has the same geometry, zeros,
+leads and growth; "fuller script" also waves of the screws, play, and what the legs give, "fuller, one" with the mean
+alone. Judged in the frame and at the tool point that suit best; "a reading" is what a reading of the tracker is off.
 `--without NAME` of `CAUSES` switches a true error off, `--keep FOLDER` keeps the files.
 """
 
@@ -37,7 +38,14 @@ CAUSES = ("anchors", "zeros", "progress", "screw", "centre", "warmth", "weight",
 INNER = "{mechanism: tricept_head.py:Tricept, base: true, allow_code: true"
 CONFIG = f"mechanism: framed\nmechanism_keys: {INNER}}}\n"
 LEADS = CONFIG.replace("base: true", "base: true, keys: {gears: [10 mm, 10 mm, 10 mm]}")
-CENTRE = LEADS.replace(" keys: {", " keys: {central: true, ")
+# Of ours: config, and which thermometers it is told: of the hall, mean of the legs, each leg.
+OURS = {
+    "ours": (CONFIG, (0, 2)),
+    "ours, leads": (LEADS, (0, 2)),
+    "ours, no hall": (LEADS, (2,)),
+    "ours, mean": (LEADS, (1, 2)),
+    "ours, one": (LEADS, (1,)),
+}
 
 
 def about(axis: int, angle: Array) -> Array:
@@ -219,17 +227,14 @@ def by_process(joints: Array, told: Array, left: Array, wanted: Array, then: Arr
     return np.stack([make(kernel, normalize_y=True, random_state=0).fit(rows, one).predict(new) for one in left.T], -1)
 
 
-def table(joints: Array, told: Array, seen: Array | None = None) -> tuple[str, Array]:
-    """Header and rows of a file in mm and deg C; `temperature` is the mean of the legs'."""
-    names = ",".join(
-        [f"q{k}[mm]" for k in (1, 2, 3)]
-        + ["temperature[degC]"]
-        + [f"temperature_leg{k}[degC]" for k in (1, 2, 3)]
-        + [f"direction{k}[1]" for k in (1, 2, 3)]
-        + ([] if seen is None else ["x[mm]", "y[mm]", "z[mm]"])
-    )
-    rows = np.c_[1e3 * joints, told[:, :3].mean(1), told]
-    return names, rows if seen is None else np.c_[rows, 1e3 * seen]
+def table(joints: Array, told: Array, hall: Array, which: tuple[int, ...], seen: Array) -> tuple[str, Array]:
+    """Header and rows of a file in mm and deg C; `seen` has no columns where nothing was measured."""
+    warm = [("temperature", hall[:, None]), ("temperature", told[:, :3].mean(1)[:, None])]
+    parts = [*(warm[k] for k in which if k < 2)]
+    parts += [(f"temperature_leg{k + 1}", told[:, [k]]) for k in range(3) if 2 in which]
+    names = [f"q{k}[mm]" for k in (1, 2, 3)] + [f"{name}[degC]" for name, _ in parts]
+    names += [f"direction{k}[1]" for k in (1, 2, 3)] + ["x[mm]", "y[mm]", "z[mm]"][: seen.shape[1]]
+    return ",".join(names), np.hstack([1e3 * joints, *(column for _, column in parts), told[:, 3:], 1e3 * seen])
 
 
 def judged(seed: int, rows: int, without: tuple[str, ...] = (), kept: Path | None = None) -> dict[str, float]:
@@ -238,19 +243,23 @@ def judged(seed: int, rows: int, without: tuple[str, ...] = (), kept: Path | Non
     joints, at, _, told = day(rows, rng)
     seen = machine.measured(joints, told, rng)
     wanted, goal, frame, then = day(NEW, rng, np.stack([told[:, :3].min(0), told[:, :3].max(0)]))
+    halls = [20.3 + rng.normal(0, 0.3, len(some)) for some in (told, then)]
     sent = {"as drawn": wanted}
     for full, who in ((False, "plain script"), (True, "fuller script")):
         numbers, left = script_fit(joints, at, told, seen, full)
         sent[who] = corrected(goal, wanted, then, numbers)
         more = by_process(joints, told, left, wanted, then)
         sent[f"{who} and process"] = corrected(goal - more, wanted, then, numbers)
+    ones = [np.c_[some[:, :3].mean(1, keepdims=True) * np.ones(3), some[:, 3:]] for some in (told, then)]
+    sent["fuller, one"] = corrected(goal, wanted, ones[1], script_fit(joints, at, ones[0], seen, True)[0])
     text = (Path(__file__).parent / "tricept_head.py").read_text()
-    files = table(joints, told, seen), table(wanted, then)
-    for who, config in (("ours", CONFIG), ("ours and leads", LEADS), ("ours and centre", CENTRE)):
+    for who, (config, which) in OURS.items():
+        records = table(joints, told, halls[0], which, seen)
+        targets = table(wanted, then, halls[1], which, np.empty((NEW, 0)))
         with TemporaryDirectory() as folder:
-            place = Path(folder) if kept is None else kept / who.replace(" ", "_")
+            place = Path(folder) if kept is None else kept / who.replace(", ", "_").replace(" ", "_")
             place.mkdir(parents=True, exist_ok=True)
-            commands = commanded(place, text, *files, "run", config, "tricept_head.py", "--allow-code")
+            commands = commanded(place, text, records, targets, "run", config, "tricept_head.py", "--allow-code")
         sent[who] = np.full_like(wanted, np.nan) if commands is None else commands
     gone = {who: bool(np.isnan(q).any()) for who, q in sent.items()}
     found = {who: np.nan if gone[who] else missed(goal, frame, machine.reached(q, then)) for who, q in sent.items()}
