@@ -24,6 +24,8 @@ def commanded(
     targets: tuple[str, Array],
     command: str = "run",
     config: str = "mechanism: machine.yaml\n",
+    file: str = "machine.yaml",
+    flags: str = "",
 ) -> Array | None:
     """Commands by the file that a calibration writes, `s x n` [SI]; None where there are none.
 
@@ -33,15 +35,17 @@ def commanded(
         records, targets: header and rows.
         command: `run` or `identify`.
         config: lines of the config beside its records.
+        file: name of the machine's file.
+        flags: of the call that writes the commands.
     """
     for name, (header, rows) in (("rows.csv", records), ("targets.csv", targets)):
         np.savetxt(folder / name, rows, "%.12g", ",", header=header, comments="")
-    (folder / "machine.yaml").write_text(machine)
+    (folder / file).write_text(machine)
     (folder / "config.yaml").write_text(f"records: rows.csv\n{config}")
     contestant = Contestant(folder, command)
     contestant.call(command, "config.yaml", f"out={command}", "save_report=false")
     model = {"run": "model.safetensors", "identify": "identified.yaml"}[command]
-    contestant.call("compensate", f"{command}/{model}", "targets.csv", f"{command}.csv")
+    contestant.call("compensate", f"{command}/{model}", "targets.csv", f"{command}.csv", *flags.split())
     path, joints = folder / f"{command}.csv", sum(column.startswith("q") for column in targets[0].split(","))
     return read_commands(path, joints).joints if path.is_file() else None
 
