@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import force_of, per_force, torque_of
+from ccnn_torch.coordinates import force_of, is_temperature, per_force, torque_of
 from ccnn_torch.effects.columns import by_joint, inside, own_parameters
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation, arm_axes
@@ -139,7 +139,7 @@ class ThermalCompliance(Effect):
         """The temperature, and positions."""
         if sees_directions(mechanism):
             return "positions: what bends turns a direction as flexure does"
-        return "" if "temperature" in covariates else "the temperature of the surroundings: temperature[degC]"
+        return "" if any(map(is_temperature, covariates)) else "the temperature of the surroundings: temperature[degC]"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """By load (where one was recorded) and by weight, joint by joint."""
@@ -155,7 +155,7 @@ class ThermalCompliance(Effect):
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x m`."""
         torques = [situation.load_torque] if situation.loaded else []
-        warm = situation.covariates["temperature"][..., None, None] - REFERENCE
+        warm = situation.temperature[..., None, None] - REFERENCE
         return by_joint(torch.stack([*torques, situation.own_weight_torque], -1) * warm)
 
 

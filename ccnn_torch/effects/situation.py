@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import is_temperature
 from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm, sees_directions
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
@@ -99,6 +100,18 @@ class Situation:
     def machine(self) -> Mechanism:
         """The nominal one under the rows' covariates: a simulator may itself say what a load does."""
         return self.mechanism.under(self.covariates)
+
+    @property
+    def thermometers(self) -> list[str]:
+        """Columns of the temperatures of parts, `temperature_NAME`."""
+        return [n for n in self.covariates if is_temperature(n) and n != "temperature" and not n.endswith(SECOND)]
+
+    @property
+    def temperature(self) -> Tensor:
+        """Of the surroundings, `... x s` [K]: the column, or the mean of the thermometers of parts without one."""
+        if "temperature" in self.covariates:
+            return self.covariates["temperature"]
+        return torch.stack([self.covariates[name] for name in self.thermometers]).mean(0)
 
     @cached_property
     def whole(self) -> Situation:

@@ -17,7 +17,6 @@ from ccnn_torch.effects.loads import Member, members
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import REFERENCE, Situation
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.records.commanded import SECOND
 
 # Rows farther apart are not one trajectory [s].
 _SAME_MOTION = 1.0
@@ -153,7 +152,8 @@ class Thermal(Effect):
     reference that was not 20 degC (a constant growth); beams that bend by what the surroundings are ahead of the body,
     T - θ; parts of the growth that follow at once, or with a lag of their own (a core in its skin); and the drives' own
     warmth, which no thermometer in the hall sees: growth of all and of the sliding drives by 1 - exp(-t / 2000 s). By
-    each further thermometer, `temperature_NAME`, growth of all these parts by what it shows beyond the first one.
+    each further thermometer, `temperature_NAME`, growth of all these parts by what it shows beyond the first one, each
+    there or not for itself: a leg grows by its own thermometer. Without `temperature` the mean of these stands for it.
 
     Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
     derivatives, so the effect is one on the pose: no joint has to replace a length (near a singularity of an arm
@@ -168,7 +168,7 @@ class Thermal(Effect):
         """Temperature, and something that has a length."""
         if not members(mechanism) and all(j.unit != "m" for j in mechanism.joints):
             return f"lengths: mechanism '{mechanism.name}' has no parameter in metres"
-        return "" if "temperature" in covariates else "the temperature of the surroundings: temperature[degC]"
+        return "" if any(map(is_temperature, covariates)) else "the temperature of the surroundings: temperature[degC]"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """The whole machine, its members, its sliding drives; then what is secondary."""
@@ -205,8 +205,10 @@ class Thermal(Effect):
             ]
         following = found[: 1 + len(_apart(mechanism)) + sum(j.unit == "m" for j in mechanism.joints)]
         found += [
-            replace(c, name=f"{c.name} {name.partition('_')[2]}", secondary=True, positive=False, part=name)
-            for name in _thermometers(situation)
+            replace(
+                c, name=f"{c.name} {name.partition('_')[2]}", secondary=True, positive=False, part=f"{name} {c.name}"
+            )
+            for name in situation.thermometers
             for c in following
         ]
         return tuple(found)
@@ -242,13 +244,13 @@ class Thermal(Effect):
         travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
         following = [whole, *apart, travel]
         timed = [whole, whole, jacobian, *following] if _timed(situation) else []
-        return torch.cat([*following, jacobian, whole, *timed, *following * len(_thermometers(situation))], -1)
+        return torch.cat([*following, jacobian, whole, *timed, *following * len(situation.thermometers)], -1)
 
     def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
         """What each of the fixed columns is multiplied by: warmth [K], or what has become of it, `... x s x m`."""
         mechanism = situation.mechanism
-        hall = situation.covariates["temperature"].expand(situation.joints.shape[:-1])
-        warm, others = hall - REFERENCE, [situation.covariates[name] - hall for name in _thermometers(situation)]
+        warm = situation.temperature.expand(situation.joints.shape[:-1]) - REFERENCE
+        others = [situation.covariates[name] - REFERENCE - warm for name in situation.thermometers]
         n, sliding = len(mechanism.joints), sum(j.unit == "m" for j in mechanism.joints)
         following, one = 1 + len(_apart(mechanism)) + sliding, torch.ones_like(warm)
         if not _timed(situation):
@@ -266,11 +268,6 @@ class Thermal(Effect):
 
 def _timed(situation: Situation) -> bool:
     return "time" in situation.covariates
-
-
-def _thermometers(situation: Situation) -> list[str]:
-    """Columns of the temperatures of parts, `temperature_NAME`."""
-    return [n for n in situation.covariates if is_temperature(n) and n != "temperature" and not n.endswith(SECOND)]
 
 
 def _apart(mechanism: Mechanism) -> list[Member]:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import is_temperature
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.checks.mistakes import PlausibleRows
 from ccnn_torch.diagnosis.residual.distance import distance, size_of
@@ -388,7 +389,7 @@ def _corrections(situation: Situation, columns: list[str]) -> Iterator[tuple[str
     for step, word in ((-1, "late"), (1, "early")):
         # The row that comes round is one of many.
         yield f"{every} seem to be shifted, one row {word}", given | {n: given[n].roll(step) for n in columns}
-    if columns and columns[0] == "temperature":
+    if columns and is_temperature(columns[0]):
         return
     yield f"{every} seem to have the other sign", given | {n: -given[n] for n in columns}
     for name in columns:
