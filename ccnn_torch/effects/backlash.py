@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import per_force
-from ccnn_torch.effects.columns import OfJoints, inside, of_rows
+from ccnn_torch.effects.columns import OfJoints, of_rows
 from ccnn_torch.effects.protocol import Coefficient, Shape
-from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation, load_columns
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.mechanisms.frames.set_ups import GIVE
 
@@ -41,7 +41,7 @@ class Backlash(OfJoints):
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """The direction of approach of at least one joint, or a load that pushes the joints to either flank."""
-        loaded = any(f"load_{c.name}" in covariates for c in inside(mechanism).pose)
+        loaded = any(name in covariates for name in load_columns(mechanism))
         return "" if loaded else _without_direction(mechanism, covariates)
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import force_of, is_temperature, torque_of
 from ccnn_torch.effects.columns import inside
-from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation, load_columns
 from ccnn_torch.effects.time import ROW
 from ccnn_torch.mechanisms import Mechanism
 
@@ -104,7 +104,7 @@ def covariate_units(mechanism: Mechanism, names: Iterable[str] = ()) -> dict[str
     """
     units = {c.name: c.unit for c in mechanism.takes} | {"time": "s", ROW: "1", "temperature": "K"}
     units |= {name: "K" for name in names if is_temperature(name)}
-    units |= {f"load_{c.name}": force_of(c.unit) for c in inside(mechanism).pose}
+    units |= load_columns(mechanism)
     units |= {torque_of(j): force_of(j.unit) for j in mechanism.joints}
     units |= {f"direction{i + 1}": "1" for i in range(len(mechanism.joints))}
     return units | {f"speed{i + 1}": f"{j.unit}/s" for i, j in enumerate(mechanism.joints)}

@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import force_of, is_temperature, per_force, torque_of
 from ccnn_torch.effects.columns import by_joint, inside, own_parameters
 from ccnn_torch.effects.protocol import Coefficient, Effect
-from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation, arm_axes
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation, arm_axes, load_columns
 from ccnn_torch.mechanisms import Mechanism, SerialArm, sees_directions
 from ccnn_torch.mechanisms.frames.set_ups import GIVE
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
@@ -81,9 +81,9 @@ class Compliance(Effect):
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """A load that was measured."""
-        there = any(f"load_{c.name}" in covariates for c in inside(mechanism).pose)
-        along = " or ".join(f"load_{c.name}[{'N' if c.unit == 'm' else 'N*m'}]" for c in inside(mechanism).pose)
-        return "" if there else f"a column of the load on the platform: {along}"
+        columns = load_columns(mechanism)
+        along = " or ".join(f"{name}[{unit}]" for name, unit in columns.items())
+        return "" if any(c in covariates for c in columns) else f"a column of the load on the platform: {along}"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """One a joint, then two a joint for what is not proportional, then the members."""
@@ -223,7 +223,7 @@ def _of_an_arm(situation: Situation) -> list[Tensor]:
         moment = moment + wrench[..., 3:]
     across = moment - (moment * axes).sum(-1, keepdim=True) * axes
     shift = torch.linalg.cross(across, lever, dim=-1)
-    tilting = (shift if wrench.shape[-1] == 3 else torch.cat([shift, across], -1)).mT
+    tilting = torch.cat([shift, across], -1)[..., : situation.jacobian.shape[-2]].mT
     away = torch.linalg.cross(*torch.broadcast_tensors(rotation.mT, force), dim=-1)  # type: ignore[no-untyped-call]
     turning = _turning(arm)
     torque = (axes @ away.mT)[..., turning, :]

@@ -9,8 +9,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import is_temperature
+from ccnn_torch.coordinates import force_of, is_temperature
 from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm, sees_directions
+from ccnn_torch.mechanisms.machines.serial import FRAME
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
 from ccnn_torch.units import STANDARD_GRAVITY
@@ -71,6 +72,16 @@ def arm_axes(arm: SerialArm, joints: Tensor, values: Tensor) -> tuple[Tensor, Te
 def has_upright_base(mechanism: Mechanism) -> bool:
     """Whether gravity is along one direction of the machine's own base, however the frames of the poses stand."""
     return isinstance(mechanism, SerialArm) and bool(mechanism.frame_per) and not sees_directions(mechanism)
+
+
+def load_columns(mechanism: Mechanism) -> dict[str, str]:
+    """Columns of the load on the platform with their units, whatever of the pose is measured: forces along its lengths,
+    moments about its angles."""
+    machine = mechanism.mechanism if isinstance(mechanism, Seen) else mechanism
+    pose = {c.name: c.unit for c in machine.pose}
+    if isinstance(machine, SerialArm) and machine.orientation == "none":
+        pose = dict(FRAME)
+    return {f"load_{name}": force_of(unit) for name, unit in pose.items()}
 
 
 @dataclass(frozen=True)
@@ -262,16 +273,19 @@ class Situation:
     @property
     def loaded(self) -> bool:
         """Whether a load on the platform was recorded."""
-        return any(f"load_{c.name}" in self.covariates for c in self.whole.mechanism.pose)
+        return any(name in self.covariates for name in load_columns(self.mechanism))
 
     @cached_property
     def wrench(self) -> Tensor:
         """Force and moment about the base frame's axes of the load on the platform, `... x s x c` [N, N·m].
 
-        The load is given along the pose coordinates; moments on an arm are about the axes of the base frame.
+        The load is given along the pose coordinates; moments on an arm are about the axes of the base frame, and are
+        not there (c = 3) where its position alone is measured and none was recorded.
         """
         zero = torch.zeros_like(self.joints[..., 0])
-        along = [self.covariates.get(f"load_{c.name}") for c in self.mechanism.pose]
+        along = [self.covariates.get(name) for name in load_columns(self.mechanism)]
+        if len(self.mechanism.pose) == 3 and all(moment is None for moment in along[3:]):
+            along = along[:3]
         force = torch.stack([zero if q is None else q.expand_as(zero) for q in along], -1)
         if self.mechanism.orientations:
             return force
@@ -297,8 +311,17 @@ class Situation:
             return torch.zeros_like(self.joints)
         if self.whole is not self:
             return self.whole.load_torque
-        torque: Tensor = _known(self.jacobian).mT @ self.wrench.unsqueeze(-1)
-        return torque.squeeze(-1)
+        slope, wrench = _known(self.jacobian), self.wrench
+        torque: Tensor = (slope.mT @ wrench[..., : slope.shape[-2]].unsqueeze(-1)).squeeze(-1)
+        if wrench.shape[-1] == slope.shape[-2]:
+            return torque
+        # Of an arm whose position alone is measured: moments turn its joints about their axes.
+        arm = self.mechanism
+        assert isinstance(arm, SerialArm)
+        values = arm.resolve(self.parameters)
+        turned = (arm_axes(arm, self.joints, values)[1] @ wrench[..., 3:].unsqueeze(-1)).squeeze(-1) * arm.revolute
+        coupled = arm.coupled(self.joints, values)
+        return torque + (turned if coupled is None else (coupled.mT @ turned.unsqueeze(-1)).squeeze(-1))
 
     @cached_property
     def weight_torque(self) -> Tensor:

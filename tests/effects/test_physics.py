@@ -142,6 +142,29 @@ def test_a_load_beside_the_measured_point_of_an_arm_does_work_where_it_acts() ->
         assert torch.allclose(found[joint.name] + beside, expected, rtol=1e-6, atol=1e-6), joint.name
 
 
+@pytest.mark.parametrize("name", ["compliance", "bending", "friction"])
+def test_moments_on_an_arm_act_whatever_of_its_pose_is_measured(name: str) -> None:
+    """The position moves as it does where the orientation is measured as well, also through a drive that couples."""
+    links = [[0.05, -1.57, 0.3, 0], [0.4, 0, 0, 0], [0.03, -1.57, 0, 0], [0, 1.57, 0.4, 0], [0, 0, 0.08, 0]]
+    joints = 0.5 + torch.rand(9, 5, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    ramp = torch.linspace(-5, 5, 9, dtype=torch.float64)
+    given = {"load_z": ramp - 60, "load_rx": ramp, "load_rz": 3 - ramp} | {f"direction{k}": ramp for k in range(1, 6)}
+    changes = []
+    for orientation in ("rotation_vector", "none"):
+        arm = SerialArm("five", "standard", links, drives=[(4, 5)], orientation=orientation)
+        coupled = [0.3 * (g.name == "drive45") for g in arm.geometry]
+        assert any(coupled)
+        machine = arm.with_nominal(arm.nominal + torch.tensor(coupled))
+        rows = Situation(machine, joints, given, default_gravity(arm))
+        made, shape = make_effect(name), acting(name, situation(ARM)).shape
+        assert not made.missing(machine, ["load_rx", *(n for n in given if n.startswith("direction"))])
+        sizes = torch.tensor([c.scale * (1 + k % 5) for k, c in enumerate(made.coefficients(rows))])
+        changes.append(signature(rows, made, shape)[..., :3, :] @ sizes.double())
+        without = {k: v for k, v in given.items() if not k.startswith("load_r")}
+        assert not torch.allclose(replace(rows, covariates=without).load_torque, rows.load_torque, rtol=1e-3)
+    torch.testing.assert_close(*changes, rtol=1e-9, atol=1e-12)
+
+
 def test_a_linear_spring_is_twice_as_far_out_under_twice_the_load_and_a_stiffening_one_four_times() -> None:
     rows = situation("five_bar")
     double = replace(rows, covariates={k: 2 * v if k.startswith("load") else v for k, v in rows.covariates.items()})
