@@ -137,8 +137,13 @@ def test_what_it_removes_has_the_figure_by_block_beside_the_one_at_random() -> N
     assert told["What it removes"].startswith(
         "420 µm → 113 µm on rows at random, 410 µm → 131 µm where nothing was measured (by block); the noise is 21.0 µm"
     )
-    assert told["How sure"] == "Probability 0.98 that these causes, and no others, act."
+    assert told["How sure"] == (
+        "Probability 0.98 that these causes act; they leave 5.4 times the noise: errors of their forms, or further "
+        "causes of that size."
+    )
     results = one_effect()[0]
+    results["gap"]["after"] = 1.9 * results["gap"]["noise_floor"]
+    assert _told(results)["How sure"] == "Probability 0.98 that these causes, and no others, act."
     next(e for e in results["effects"] if e["name"] == "thermal")["probability"] = 0.71
     assert _told(results)["How sure"] == (
         "Probability 0.98 that these causes act; likely beside them: thermal growth (0.71)."

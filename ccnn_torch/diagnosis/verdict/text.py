@@ -23,6 +23,8 @@ LEAST = "at the least sure joint"
 """Of several joints the least probable verdict is that of the whole."""
 # From this probability on an effect is likely, whatever the verdict names.
 _LIKELY = 0.5
+# Of the noise, from which what is left may be another cause.
+_MUCH_LEFT = 2.0
 # Below this probability the rows determine no verdict: it is but the likeliest of many.
 _OPEN = 0.05
 # What is left beyond so many steps of an encoder is not its noise.
@@ -142,7 +144,14 @@ def others_words(results: Block) -> str:
     likely = [e for name, e in every.items() if name not in told and e["probability"] >= _LIKELY]
     likely.sort(key=lambda e: -e["probability"])
     each = listed([f"{words_of(e['name']).short} ({probability_words(e['probability'])})" for e in likely])
-    return f"that these causes act; likely beside them: {each}" if likely else "that these causes, and no others, act"
+    if likely:
+        return f"that these causes act; likely beside them: {each}"
+    gap = results["gap"]
+    times = (gap["after"] or 0.0) / gap["noise_floor"] if gap["noise_floor"] else 0.0
+    if times < _MUCH_LEFT or in_doubt(results):
+        return "that these causes, and no others, act"
+    rest = "errors of their forms, or further causes of that size"
+    return f"that these causes act; they leave {_times(times)} times the noise: {rest}"
 
 
 def undetermined(results: Block) -> str:
