@@ -116,7 +116,7 @@ def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
     if source is not None:
         raise InputError(
             f"{source} names Python code, {spec}, which would run; look at that file, and if you trust it allow it: "
-            "--allow-code (ccnn compensate, ccnn verify), allow_code=True (Python), mechanism_keys.allow_code=true "
+            "--allow-code (ccnn compensate, export, verify), allow_code=True (Python), mechanism_keys.allow_code=true "
             "(configs)"
         )
     file, _, name = spec.rpartition(":")

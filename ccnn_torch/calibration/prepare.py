@@ -29,6 +29,7 @@ from ccnn_torch.config.sizes import size
 from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.from_file import Verdict
+from ccnn_torch.diagnosis.from_records import refuse_far_rows
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, as_measured, load_mechanism
 from ccnn_torch.mechanisms.frames.partial import completed
@@ -233,6 +234,8 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
     mechanism = as_measured(mechanism, records.pose_coordinates, records.path, records.pose)
+    if not getattr(mechanism, "unknown_frames", ()):
+        refuse_far_rows(records, mechanism)
     unlearnable = _unlearnable(mechanism, records)
     if unlearnable and method_names(config, "constant") != ["constant"]:
         raise InputError(

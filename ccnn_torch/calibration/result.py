@@ -179,10 +179,12 @@ def _not_reached(pose: Pose, damped: float) -> list[str]:
             found.append(f"{after:.3g} {unit} of {kind} where the model leaves {explained:.3g} unexplained")
     if not found:
         return []
-    return [
-        f"The commands of the file leave {' and '.join(found)}: at {damped:.1%} of the rows they are damped, near a "
-        "singular pose or at a limit of the joints (status 3)."
-    ]
+    why = (
+        f"at {damped:.1%} of the rows they are damped, near a singular pose or at a limit of the joints (status 3)"
+        if damped
+        else "no row is damped, so that what the file holds of the machine is coarser than what was identified"
+    )
+    return [f"The commands of the file leave {' and '.join(found)}: {why}."]
 
 
 def _certainty(

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Condition
-from ccnn_torch.diagnosis.checks.mistakes import what_is_wrong
+from ccnn_torch.diagnosis.checks.mistakes import plausible_rows, what_is_wrong
 from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.from_file import (
@@ -234,6 +234,13 @@ def naming(records: Records) -> Iterator[None]:
         yield
     except RowsError as reason:
         raise RowsError(f"{records.path}: {reason}") from None
+
+
+def refuse_far_rows(records: Records, mechanism: Mechanism) -> None:
+    """Raise RowsError where the usual row is not of this machine: in another frame, with joints of other signs ..."""
+    situation = situation_of(records, mechanism)
+    with naming(records):
+        plausible_rows(situation, records.pose)
 
 
 def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float] | None = None) -> Situation:

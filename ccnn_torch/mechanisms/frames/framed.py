@@ -80,7 +80,11 @@ class Framed(Around):
             )
         taken = {f"{place}_{c}" for place in ("base", "tool") for c, _ in FRAME} & {g.name for g in inner.geometry}
         if taken:
-            raise InputError(f"mechanism '{inner.name}' has frames of its own: {', '.join(sorted(taken))}")
+            names = ", ".join(sorted(taken))
+            raise InputError(
+                f"mechanism '{inner.name}' has parameters that are called as the frames of 'framed' are: {names}; take "
+                "a mechanism without frames of its own, or give these parameters other names (point_x)"
+            )
         frames = {place: [Parameter(f"{place}_{c}", u, 0.0) for c, u in FRAME] for place in ("base", "tool")}
         start = inner.frame(inner.home_pose)
         super().__init__(
