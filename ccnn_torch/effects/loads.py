@@ -66,8 +66,8 @@ _TYPICAL = {"m": 100.0, "rad": 30.0}
 
 
 class Compliance(Effect):
-    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = force or torque of the load on the joint; and
-    members that give, e_k.
+    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = force or torque of the load on the joint, and of an
+    arm's own weight where its file tells its masses: one spring carries both; and members that give, e_k.
 
     τ_0 = 100 N or 30 N·m: d and h are changes of compliance there. Secondary as well, the members: a leg stretches in
     all its lengths p in proportion to the force of the load on them, Δp = e (∂x/∂p) · load (virtual work); a link of an
@@ -113,7 +113,7 @@ class Compliance(Effect):
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
-        jacobian, torque = torch.nan_to_num(situation.jacobian), situation.load_torque
+        jacobian, torque = torch.nan_to_num(situation.jacobian), situation.carried_torque
         typical = torch.tensor([_TYPICAL[j.unit] for j in situation.mechanism.joints], dtype=torch.float64)
         ratio = torque.abs() / typical
         parts = [jacobian * (torque * ratio**k).unsqueeze(-2) for k in range(3)]

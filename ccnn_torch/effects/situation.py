@@ -344,6 +344,15 @@ class Situation:
         return self.weight_torque
 
     @cached_property
+    def carried_torque(self) -> Tensor:
+        """Force or torque on each joint of the load, and of an arm's own weight where its file tells its masses, by
+        virtual work, `... x s x n` [N or N·m]: what springs of the drives carry."""
+        arm = self.whole.mechanism
+        if not isinstance(arm, SerialArm) or not len(arm.masses):
+            return self.load_torque
+        return self.load_torque + STANDARD_GRAVITY * arm.masses.sum() * self.own_weight_torque
+
+    @cached_property
     def inner_weight_torque(self) -> Tensor:
         """As `own_weight_torque` of an arm whose links are the heavier the nearer they are to its base: each is
         multiplied by what falls linearly to 0 at the last."""
