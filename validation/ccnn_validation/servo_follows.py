@@ -8,10 +8,11 @@ bends and returns with each turn, cogging. Three runs of 8 s are logged: moves, 
 runs that are sent once: S-curves to other places at other speeds, a sweep of sines, a circle with two turns.
 
 All know the data sheet: gains, feedforward, masses, friction, lead. "shifted" sends the commands earlier by the mean
-lag. "regression" is what the command is beyond the measured motion, as a linear function of that. "plain script" fits a
-simulated cascade by least squares and iterates its error away. Ours: `ccnn diagnose --motion` with the mechanism servo
-without keys ("ours, bare") and with those of the data sheet ("ours, keys"), and with a simulator of the linear cascade
-in Python ("ours, own simulator"), each followed by `ccnn compensate`.
+lag. "regression" is what the command is beyond the measured motion, as a linear function of that. "plain script" fits
+a simulated cascade by least squares and iterates its error away. Ours: `ccnn diagnose --motion`, `ccnn compensate` with
+the mechanism servo without keys ("ours, bare"), with those of the data sheet ("ours, keys"; "no integral" leaves out
+that of the speed loop, since the servo's is of the position alone), and with simulators in Python ("linear cascade",
+and "cascade" with dry friction and delays). Told: RMS / peak in the plane of each run [µm], and the RMS of x and y.
 """
 
 from __future__ import annotations
@@ -39,8 +40,12 @@ KP, KV, TI, FORWARD, MOTOR, TABLE, VISCOUS, COULOMB, LEAD = 60.0, 56e3, 8e-3, 0.
 # Of an encoder: standard deviation and step of a reading [m].
 NOISE, COUNT = 1e-7, 1e-7
 CAUSES = ("mass", "forward", "friction", "soft", "play", "delay", "lead", "cogging")
-KEYS = "mechanism_keys={{gain: {:.6g}, integral: {:.6g}, derivative: {:.6g}, inertia: {:g}, viscous: {:.6g}, coulomb: {:g}}}"
+KEYS = (
+    "mechanism_keys={{gain: {:.6g}, integral: {:.6g}, derivative: {:.6g}, inertia: {:g}, viscous: {:.6g}, "
+    "coulomb: {:g}}}"
+)
 SIMULATOR = '''"""Two axes under a cascade: position gain, feedforward of speed, PI of the speed."""
+import numba
 import numpy as np
 from scipy.signal import cont2discrete, lfilter
 
@@ -58,6 +63,41 @@ class STAGE:
             below = np.polyadd([mass, viscous, 0, 0], np.polymul(pi, [1, kp]))
             b, a, _ = cont2discrete((np.polymul(pi, [forward, kp]), below), step, "foh")
             found[:, k] = lfilter(b[0], a, commands[:, k] - commands[0, k]) + commands[0, k]
+        return found
+
+
+@numba.njit
+def driven(c, step, delay, kp, forward, lag, mass, viscous, dry):
+    """The same with dry friction and delays, two steps to a sample."""
+    found, at, total, v, fed, h = c.copy(), c[0], 0.0, 0.0, 0.0, step / 2
+    before = c[0]
+    for i in range(1, 2 * len(c) - 1):
+        late = max(i / 2 - delay / step, 0.0)
+        k = int(late)
+        ref = c[k] + (late - k) * (c[min(k + 1, len(c) - 1)] - c[k])
+        fed += h / (h + max(lag, 0.0)) * ((ref - before) / h - fed)
+        before, aim = ref, kp * (ref - at) + forward * fed
+        push = mass / h * v + 56e3 * aim + total
+        v = (push - min(max(push, -dry), dry)) / (mass / h + viscous + 56e3)
+        total += 56e3 / 8e-3 * h * (aim - v)
+        at += v * h
+        if i % 2 == 0:
+            found[i // 2] = at
+    return found
+
+
+class CASCADE:
+    parameters = {f"{name}{k}": value for k in (1, 2) for name, value in (
+        ("delay", 5e-4), ("position_gain", 60.0), ("forward", 0.9), ("lag", 5e-4), ("mass", 178.0), ("viscous", 500.0),
+        ("coulomb", 40.0))}
+
+    def simulate(self, time, commands, parameters):
+        step = (time[-1] - time[0]) / (len(time) - 1)
+        names = ("delay", "position_gain", "forward", "lag", "mass", "viscous", "coulomb")
+        found = commands.copy()
+        for k in range(commands.shape[1]):
+            numbers = (float(parameters[f"{name}{k + 1}"]) for name in names)
+            found[:, k] = driven(np.ascontiguousarray(commands[:, k]), step, *numbers)
         return found
 '''
 
@@ -98,7 +138,11 @@ class Axes:
         sent = np.stack(runs, 1)
         times, fine = np.arange(len(sent)) * STEP, np.arange((len(sent) - 1) * inner + 1) * FINE
         refs = np.stack(
-            [np.stack([np.interp(fine - self.delay[k], times, sent[:, i, k]) for k in range(2)], -1) for i in range(count)], 1
+            [
+                np.stack([np.interp(fine - self.delay[k], times, sent[:, i, k]) for k in range(2)], -1)
+                for i in range(count)
+            ],
+            1,
         )
         shape, found = (count, 2), np.empty_like(sent)
         xm, vm, vl, force, total, fed, zm, zl = sent[0].copy(), *(np.zeros(shape) for _ in range(7))
@@ -129,7 +173,7 @@ class Axes:
 
 def moves(places: Array, speeds: Array, rate: float, rest: float) -> Array:
     """Ways between places [m] at speeds [m/s], `SAMPLES`; accelerations `rate` [m/s²], rounded over 50 ms."""
-    pieces = [np.full(400, places[0])]
+    pieces: list[Array] = [np.full(400, places[0])]
     for a, b, speed in zip(places[:-1], places[1:], speeds, strict=True):
         way, speed = abs(b - a), min(speed, np.sqrt(rate * abs(b - a)))
         ramp, whole = speed / rate, way / speed + speed / rate
@@ -137,8 +181,8 @@ def moves(places: Array, speeds: Array, rate: float, rest: float) -> Array:
         done = np.minimum(t, ramp) ** 2 * rate / 2 + speed * np.clip(t - ramp, 0, whole - 2 * ramp)
         late = np.clip(t - whole + ramp, 0, ramp)
         pieces += [a + np.sign(b - a) * (done + speed * late - rate * late**2 / 2), np.full(int(rest / STEP), b)]
-    course = np.concatenate(pieces)[:SAMPLES]
-    course = np.pad(course, (0, SAMPLES - len(course)), mode="edge")
+    whole_course = np.concatenate(pieces)[:SAMPLES]
+    course = np.pad(whole_course, (0, SAMPLES - len(whole_course)), mode="edge")
     return np.asarray(uniform_filter1d(uniform_filter1d(course, 40, mode="nearest"), 10, mode="nearest"))
 
 
@@ -150,7 +194,8 @@ def slopes(t: Array) -> Array:
 
 def logged(rng: np.random.Generator) -> list[Array]:
     """Commands of the three runs of the log, `s x 2` [m]: moves, slow ways, sines."""
-    t, runs = np.arange(SAMPLES) * STEP, [[], [], []]  # type: tuple[Array, list[list[Array]]]
+    t = np.asarray(np.arange(SAMPLES) * STEP, dtype=np.float64)
+    runs: list[list[Array]] = [[], [], []]
     for _ in range(2):
         runs[0].append(moves(rng.uniform(-0.12, 0.12, 25), rng.uniform(0.05, 0.25, 24), 3.0, 0.15))
         end, speed = rng.uniform(0.09, 0.12), rng.uniform(0.05, 0.07)
@@ -162,12 +207,15 @@ def logged(rng: np.random.Generator) -> list[Array]:
 
 def wanted(rng: np.random.Generator) -> dict[str, Array]:
     """The new runs, `s x 2` [m]."""
-    t, s_curves, sweep = np.arange(SAMPLES) * STEP, [], []
+    t = np.asarray(np.arange(SAMPLES) * STEP, dtype=np.float64)
+    s_curves, sweep = [], []
     for _ in range(2):
         s_curves.append(moves(rng.uniform(-0.11, 0.11, 15), rng.uniform(0.08, 0.2, 14), 2.0, 0.25))
         rate = 0.5 * 8 ** (t / t[-1])
         angle = 2 * np.pi * np.cumsum(rate) * STEP
-        sweep.append(rng.uniform(-0.05, 0.05) + slopes(t) * 0.12 / (2 * np.pi * rate) * np.sin(angle + rng.uniform(0, 6)))
+        sweep.append(
+            rng.uniform(-0.05, 0.05) + slopes(t) * 0.12 / (2 * np.pi * rate) * np.sin(angle + rng.uniform(0, 6))
+        )
     angle = np.cumsum(np.clip(np.minimum(t - 0.4, 7.4 - t) / 0.6, 0, 1))
     angle = 4 * np.pi * uniform_filter1d(angle / angle[-1], 60, mode="nearest") + rng.uniform(0, 6)
     circle = rng.uniform(-0.05, 0.05, 2) + rng.uniform(0.03, 0.05) * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -193,11 +241,13 @@ def earlier(course: Array, lag: Array) -> Array:
 
 
 def regression(runs: list[Array], seen: list[Array], new: list[Array]) -> list[Array]:
-    """What the command is beyond the motion, linear in place, turn of the screw, speed, its sign, acceleration, jerk."""
+    """What the command is beyond the motion, linear in place, the screw's turn, speed, its sign, and so on."""
 
     def features(q: Array) -> Array:
         v, a, j, turn = smooth(q, 1), smooth(q, 2), smooth(q, 3, 5.0), 2 * np.pi * q / LEAD
-        return np.stack([1 + 0 * q, q, q**2, np.sin(turn), np.cos(turn), v, a, j, np.tanh(v / 2e-3), np.tanh(v / 2e-2)], -1)
+        return np.stack(
+            [1 + 0 * q, q, q**2, np.sin(turn), np.cos(turn), v, a, j, np.tanh(v / 2e-3), np.tanh(v / 2e-2)], -1
+        )
 
     known = np.concatenate([features(smooth(q)) for q in seen])
     more = np.concatenate([c - smooth(q) for q, c in zip(seen, runs, strict=True)])
@@ -217,7 +267,13 @@ def cascade(x: Array, sent: Array) -> Array:
     late = np.arange((len(sent) - 1) * parts + 1) * step
     delay, kp, forward, lag, mass, viscous, dry, rest, *lead, play, give = x
     refs = np.stack([np.interp(late - delay[k], t, sent[:, k]) for k in range(sent.shape[1])], -1)
-    at, table, total, v, fed = refs[0].copy(), refs[0].copy(), np.zeros_like(mass), np.zeros_like(mass), np.zeros_like(mass)
+    at, table, total, v, fed = (
+        refs[0].copy(),
+        refs[0].copy(),
+        np.zeros_like(mass),
+        np.zeros_like(mass),
+        np.zeros_like(mass),
+    )
     found, free = np.empty_like(sent), 1 / (mass / step + viscous + KV)
     found[0] = table
     for i in range(1, len(refs)):
@@ -233,30 +289,36 @@ def cascade(x: Array, sent: Array) -> Array:
         if i % parts == 0:
             found[i // parts] = table
     turn = 2 * np.pi / LEAD * found
-    return np.asarray(found + lead[0] * found + lead[1] * (found / 0.15) ** 2 + lead[2] * np.sin(turn) + lead[3] * np.cos(turn))
+    return np.asarray(
+        found + lead[0] * found + lead[1] * (found / 0.15) ** 2 + lead[2] * np.sin(turn) + lead[3] * np.cos(turn)
+    )
+
+
+def fitted(sent: Array, measured: Array) -> Array:
+    """Numbers of the plain script by the runs of one axis, `s x runs` [m]."""
+    count = len(START)
+
+    def left(u: Array) -> Array:
+        sets = np.repeat(START[:, None] + SIZES[:, None] * u, sent.shape[1], 1)
+        found = cascade(sets, np.tile(sent, u.shape[1])).reshape(len(sent), -1, sent.shape[1])
+        return np.asarray((found - measured[:, None]).swapaxes(0, 1).reshape(-1, sent.size)[:, ::4] * 1e6)
+
+    def residuals(u: Array) -> Array:
+        return np.asarray(np.r_[left(u[:, None])[0], u])
+
+    def jacobian(u: Array) -> Array:
+        many = left(np.c_[u, u[:, None] + 1e-3 * np.eye(count)])
+        return np.asarray(np.r_[(many[1:] - many[0]).T / 1e-3, np.eye(count)])
+
+    return np.asarray(START + SIZES * least_squares(residuals, np.zeros(count), jacobian, max_nfev=40).x)
 
 
 def plain_script(runs: list[Array], seen: list[Array], new: list[Array]) -> list[Array]:
     """Fit the cascade to each axis, and move the commands of new runs by the error that it predicts."""
     corrected = [run.copy() for run in new]
     for k in range(2):
-        sent, measured = (np.stack([run[:, k] for run in data], -1) for data in (runs, seen))
-
-        def left(u: Array, sent: Array = sent, measured: Array = measured) -> Array:
-            sets = np.repeat((START[:, None] + SIZES[:, None] * u.reshape(len(START), -1)), sent.shape[1], 1)
-            found = cascade(sets, np.tile(sent, u.size // len(START))).reshape(len(sent), -1, sent.shape[1])
-            return np.asarray((found - measured[:, None]).swapaxes(0, 1).reshape(-1, sent.size)[:, ::4] * 1e6)
-
-        def residuals(u: Array, left: object = left) -> Array:
-            return np.r_[left(u)[0], u]  # type: ignore[operator]
-
-        def jacobian(u: Array, left: object = left) -> Array:
-            many = left(np.c_[u, u[:, None] + 1e-3 * np.eye(len(u))])  # type: ignore[operator]
-            return np.r_[(many[1:] - many[0]).T / 1e-3, np.eye(len(u))]
-
-        fit = least_squares(residuals, np.zeros(len(START)), jacobian, max_nfev=40)
-        numbers = np.repeat((START + SIZES * fit.x)[:, None], len(new), 1)
-        goal = np.stack([run[:, k] for run in new], -1)
+        sent, measured, goal = (np.stack([run[:, k] for run in data], -1) for data in (runs, seen, new))
+        numbers = np.repeat(fitted(sent, measured)[:, None], len(new), 1)
         course, best = goal.copy(), np.full(len(new), np.inf)
         for _ in range(12):
             error = goal - cascade(numbers, course)
@@ -267,8 +329,10 @@ def plain_script(runs: list[Array], seen: list[Array], new: list[Array]) -> list
     return corrected
 
 
-def keys() -> str:
+def keys(integral: bool) -> str:
     """The cascade by the data sheet as keys of the servo, from the sum of the terms of the motor's force."""
+    if not integral:
+        return KEYS.format(KV * KP, 0, FORWARD / KP, MOTOR + TABLE, VISCOUS + KV * (1 - FORWARD), COULOMB)
     gain = KV * (KP + FORWARD / TI)
     return KEYS.format(
         gain, KV * KP / TI / gain, KV * FORWARD / gain, MOTOR + TABLE, VISCOUS + KV * (1 - FORWARD), COULOMB
@@ -286,14 +350,19 @@ def ours(folder: Path, name: str, runs: list[Array], seen: list[Array], new: lis
     np.savetxt(folder / "motion.csv", many, "%.8g", ",", header=f"run[1],time[s],{motion}", comments="")
     (folder / "stage.py").write_text(SIMULATOR)
     contestant = Contestant(folder, "diagnose")
-    options = {"bare": ["servo"], "keys": ["servo", keys()], "own simulator": ["stage.py:STAGE"]}[name]
+    choices = {"bare": ["servo"], "keys": ["servo", keys(True)], "no integral": ["servo", keys(False)]}
+    options = (choices | {"linear cascade": ["stage.py:STAGE"], "cascade": ["stage.py:CASCADE"]})[name]
     options = ["--mechanism", options[0], "--out", "found", *options[1:]]
     start = clock.time()
     contestant.call("diagnose", *(word for i in (1, 2, 3) for word in ("--motion", f"run{i}.csv")), *options)
     between = clock.time()
-    allow = ["--allow-code"] if name == "own simulator" else []
+    allow = ["--allow-code"] if name.endswith("cascade") else []
     contestant.call("compensate", "found/identified_motion.json", "motion.csv", "commands.csv", *allow)
-    print(f"  {name}: diagnose {between - start:.0f} s, compensate {clock.time() - between:.0f} s", contestant.said, file=sys.stderr)
+    print(
+        f"  {name}: diagnose {between - start:.0f} s, compensate {clock.time() - between:.0f} s",
+        contestant.said,
+        file=sys.stderr,
+    )
     path = folder / "commands.csv"
     if not path.is_file():
         return None
@@ -303,7 +372,7 @@ def ours(folder: Path, name: str, runs: list[Array], seen: list[Array], new: lis
 
 
 def judged(seed: int, without: str, folder: Path, names: list[str]) -> dict[str, dict[str, list[float]]]:
-    """RMS and peak of the following error in the plane [µm], by contestant and new run."""
+    """RMS and peak in the plane, RMS of x and y of the following error [µm], by contestant and new run."""
     axes, rng = Axes(seed, without), np.random.default_rng([seed, 1])
     print(f"seed {seed}: x has {axes.causes[0]}; y has {axes.causes[1]}")
     runs = logged(rng)
@@ -323,8 +392,9 @@ def judged(seed: int, without: str, folder: Path, names: list[str]) -> dict[str,
     for j, who in enumerate(sent):
         table[who] = {}
         for i, (kind, goal) in enumerate(goals.items()):
-            off = 1e6 * np.linalg.norm(went[j * len(new) + i] - goal, axis=1)[EDGE:-EDGE]
-            table[who][kind] = [float(np.sqrt((off**2).mean())), float(off.max())]
+            off = 1e6 * (went[j * len(new) + i] - goal)[EDGE:-EDGE]
+            far = np.linalg.norm(off, axis=1)
+            table[who][kind] = [np.sqrt((far**2).mean()), far.max(), *np.sqrt((off**2).mean(0))]
     return table
 
 
@@ -335,14 +405,15 @@ def main() -> None:
     options.add_argument("--stages", type=int, default=1)
     options.add_argument("--without", choices=("", *CAUSES), default="", help="a cause that is switched off")
     options.add_argument("--keep", type=Path, help="folder of the files; by default a temporary one")
-    options.add_argument("--ours", default="bare,keys,own simulator")
+    options.add_argument("--ours", default="bare,keys,no integral,linear cascade,cascade")
     given = options.parse_args()
     folder = given.keep or Path(mkdtemp())
     folder.mkdir(parents=True, exist_ok=True)
     for seed in range(given.seed, given.seed + given.stages):
         found = judged(seed, given.without, folder, [name for name in given.ours.split(",") if name])
         for who, kinds in found.items():
-            print(f"  {who:20}" + "   ".join(f"{kind} {rms:7.2f} / {peak:7.2f}" for kind, (rms, peak) in kinds.items()))
+            told = (f"{kind} {a:.2f} / {b:.2f} ({x:.2f}, {y:.2f})" for kind, (a, b, x, y) in kinds.items())
+            print(f"  {who}: " + "   ".join(told))
         (folder / f"{seed}{given.without}.json").write_text(json.dumps(found, indent=1))
 
 
