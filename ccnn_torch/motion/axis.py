@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.motion.compilable import is_compiled
-from ccnn_torch.motion.course import course, courses
+from ccnn_torch.motion.course import course, courses, curved
 from ccnn_torch.motion.stage import ABSENT, TINY, Given, axis_of
 from ccnn_torch.motion.stretches import PLACES, START
 
@@ -109,9 +109,8 @@ def simulate_axes(
         together = courses(given, has, own, run, time, command, start, bent, push, supply, warm, parts)
         return torch.from_numpy(together).reshape(*runs.shape, s)
     row = run % len(time)
-    late = np.stack(
-        [np.interp(time[k] - d, time[k], command[j]) for k, j, d in zip(row, run, a.delay[own], strict=True)]
-    )
+    delayed = zip(row, run, a.delay[own], strict=True)
+    late = np.stack([_late(time[k], command[j], d, float(bent[j % len(bent)])) for k, j, d in delayed])
     u, step = late * (1 + a.ratio[own, None]) + a.offset[own, None], np.diff(time)
     found = np.empty((len(run), s))
     for many in np.unique(parts):
@@ -123,6 +122,19 @@ def simulate_axes(
         )
         found[here] = course(some, has_any, one, u[here].T.copy(), begin, bend, resists, volts, heat, int(many)).T
     return torch.from_numpy(found).reshape(*runs.shape, s)
+
+
+def _late(time: Array, command: Array, delay: float, bent: float) -> Array:
+    """The command of so much before, `s`; arguments as of `Drive`."""
+    at = time - delay
+    found: Array = np.interp(at, time, command)
+    if bent == 0 or delay == 0:
+        return found
+    turns = np.diff(command, 2)
+    bends = curved(turns[[0, *range(len(turns))]], turns[[*range(len(turns)), -1]])
+    which = np.clip(np.searchsorted(time, at, "right") - 1, 0, len(time) - 2)
+    share = np.clip((at - time[which]) / (time[which + 1] - time[which]), 0.0, 1.0)
+    return found + bent * share * (1 - share) * bends[which]
 
 
 def _start_of(drive: Drive) -> Array:

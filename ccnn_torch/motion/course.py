@@ -128,7 +128,12 @@ def _bend(u: Array, k: int) -> Array:
     next; 0 at a jump or corner."""
     last = len(u) - 3
     i, j = min(max(k - 1, 0), last), min(k, last)
-    a, b = (u[i + 2] - u[i + 1]) - (u[i + 1] - u[i]), (u[j + 2] - u[j + 1]) - (u[j + 1] - u[j])
+    return curved((u[i + 2] - u[i + 1]) - (u[i + 1] - u[i]), (u[j + 2] - u[j + 1]) - (u[j + 1] - u[j]))
+
+
+@compilable
+def curved(a: Array, b: Array) -> Array:
+    """As `_bend`, of the second differences about both ends of a step."""
     # The mean of both curvatures, at most twice the smaller one (van Leer 1977).
     least = np.minimum(np.abs(a), np.abs(b))
     found: Array = pick(a * b > 0, -0.5 * np.sign(a) * np.minimum(np.abs(a + b) / 2, 2 * least), 0.0 * a)
@@ -205,7 +210,10 @@ def courses(
                 i += 1
             late = asked[i]
             if times[i] < t and i < count - 1:
-                late += (asked[i + 1] - late) / (times[i + 1] - times[i]) * (t - times[i])
+                share = (t - times[i]) / (times[i + 1] - times[i])
+                late += share * (asked[i + 1] - asked[i])
+                if bent[b % len(bent)] > 0:
+                    late += bent[b % len(bent)] * share * (1 - share) * _bend(asked, i)
             u[k] = late * (1 + axis.own.ratio) + axis.own.offset
             if k > 0:
                 step[k - 1] = times[k] - times[k - 1]

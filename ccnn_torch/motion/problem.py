@@ -168,20 +168,20 @@ class Problem:
         if start is not None:
             drive = drive._replace(start=start.flatten(0, 1))
         parameters = self.library.parameters(theta, axis)
-        own, mass = below(parameters, OWN), parameters.get(CARRIED)
+        own, mass, changed = below(parameters, OWN), parameters.get(CARRIED), dict[str, Tensor]()
         if mass is not None and self.driven.carried is not None:
             torque = mass[:, None, None] * self.driven.carried[axis]
-            if self.driven.torque is not None:
-                torque = torque + self.driven.torque[axis]
+            changed["torque"] = torque if self.driven.torque is None else torque + self.driven.torque[axis]
+        if own and self.driven.own:
+            # What an axis does to a simulator's positions it does to what its own parameters change of them.
+            shifts = [own[name][:, None, None] * makes[axis] for name, makes in self.driven.own.items() if name in own]
+            changed["command"] = self.driven.followed[axis] + sum(shifts)
+        if changed:
             # Each model has runs of its own then.
             at = {name: v[which.flatten() % len(v)] for name, v in drive._asdict().items() if v is not None}
-            drive = drive._replace(**at | {"torque": torque.flatten(0, 1)})
+            drive = drive._replace(**at | {name: v.flatten(0, 1) for name, v in changed.items()})
             which = torch.arange(which.numel()).reshape(which.shape)
-        moved = simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
-        for name, makes in self.driven.own.items():
-            if name in own:
-                moved = moved + own[name][:, None, None] * makes[axis]
-        return moved
+        return simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
 
     def residual(self, theta: Tensor, axis: Tensor) -> Tensor:
         """Measured less simulated, as `positions`; finite."""
