@@ -19,7 +19,7 @@ from ccnn_torch.effects.words import words_of
 from ccnn_torch.evidence.shrink import INTERVAL, Draws, Gap, draws
 from ccnn_torch.motion.effects import Facts, Number, motion_effects
 from ccnn_torch.motion.fit import ALONE, deviations
-from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
+from ccnn_torch.motion.held_out import best_to_follow, gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes, no_worse
 from ccnn_torch.motion.known import TIME, allowed_text, share_of
 from ccnn_torch.motion.library import Library
@@ -30,7 +30,7 @@ from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.setting import problem_of
-from ccnn_torch.motion.spec import Fit
+from ccnn_torch.motion.spec import Fit, Spec
 from ccnn_torch.motion.stretches import PHASES, Stretches, phases_of
 from ccnn_torch.units import STANDARD_GRAVITY
 
@@ -44,6 +44,7 @@ class MotionDiagnosis(Said):
         found: what was fitted.
         verdicts: of each axis.
         before, after: residuals held out, with nothing and with the verdict's effects, `n x b x s` [rad or m].
+        followed, left: the set of each axis by which commands are made, and what it leaves so, `n x b x s` [rad or m].
         proposed: the motions of `next_measurements`.
         nominal: the model.
     """
@@ -53,6 +54,8 @@ class MotionDiagnosis(Said):
     verdicts: Sequence[AxisVerdict] = field(repr=False)
     before: Tensor = field(repr=False)
     after: Tensor = field(repr=False)
+    followed: Sequence[Spec] = field(repr=False)
+    left: Tensor = field(repr=False)
     proposed: Sequence[Motion] = field(repr=False)
     nominal: Nominal = field(repr=False)
 
@@ -164,7 +167,9 @@ def _diagnosed(
         cautions=[*cautions, *_worse_of(library, judged, verdicts), *_hidden_of(problem, verdicts)],
         notes=_notes_of(folded, nominal, found, verdicts, total.floor, noise),
     )
-    return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed, nominal)
+    after = residuals[len(names)]
+    followed = best_to_follow(folded, found, verdicts, after)
+    return MotionDiagnosis(content, problem, found, verdicts, nothing, after, *followed, proposed, nominal)
 
 
 # A run is apart that leaves so many times as much as any other, of so many at least.

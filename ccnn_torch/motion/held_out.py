@@ -11,7 +11,7 @@ from ccnn_torch.evidence.shrink import Draws, Gap, HeldOut, shrink_of
 from ccnn_torch.motion.descent import refitted
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.problem import Problem
-from ccnn_torch.motion.search import Search
+from ccnn_torch.motion.search import Search, log_posterior
 from ccnn_torch.motion.spec import Spec, nothing, without
 from ccnn_torch.motion.whiten import Whitening
 
@@ -33,6 +33,29 @@ def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spe
         here = (problem.fold == k).nonzero()[:, 0]
         left[:, here] = problem.of(here).residual(theta, axis)
     return left.reshape(len(sets), -1, *left.shape[1:])
+
+
+def best_to_follow(
+    problem: Problem, found: Search, verdicts: Sequence[AxisVerdict], left: Tensor
+) -> tuple[list[Spec], Tensor]:
+    """Of each axis the set that leaves least of runs that no fit saw, and what that is, `n x b x s` [rad or m].
+
+    A verdict has the fewest names that are sure; a command is the better the more is in it that the runs bear out.
+    Beside the verdict's set stand the likeliest one under the noise that it leaves itself, and the closest fit.
+
+    Args:
+        problem: as of `held_out`.
+        found: all sets.
+        verdicts: of each axis.
+        left: what the verdicts' sets leave so, as of `held_out`.
+    """
+    likeliest = [max(fits, key=log_posterior).spec for fits in found.found]
+    closest = [min(fits, key=lambda fit: fit.rss).spec for fits in found.found]
+    sets = [[v.best.spec for v in verdicts], likeliest, closest]
+    residuals = torch.cat([left[None], held_out(problem, found.whitening, sets[1:])])
+    least = residuals[..., problem.data.judged].square().mean(-1).argmin(0).tolist()
+    chosen = torch.stack([residuals[k, i] for i, k in enumerate(least)])
+    return [sets[k][i] for i, k in enumerate(least)], chosen
 
 
 def gap_of(problem: Problem, before: Tensor, after: Tensor, floor: float, known: bool, draws: Draws) -> Gap:

@@ -81,17 +81,17 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
         keys: of the mechanism, as given.
     """
     library, data = found.problem.library, found.problem.data
-    values = library.parameters(torch.stack([v.best.spec.theta for v in found.verdicts]), found.problem.axes)
+    values = library.parameters(torch.stack([spec.theta for spec in found.followed]), found.problem.axes)
     own = {name.removeprefix(OWN): values.pop(name) for name in [*values] if name.startswith(OWN)}
     values.pop(CARRIED, None)
-    count = len(found.verdicts)
+    count = len(found.followed)
     axes = [{name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]} for i in range(count)]
     content = _File(
         mechanism=nominal.name,
         mechanism_keys=dict(keys),
         units=list(data.units),
-        effects=found.verdict["effects"],
-        left=[float(own[data.judged].square().mean().sqrt()) for own in found.after],
+        effects=list(dict.fromkeys(library.names[m] for spec in found.followed for m in spec.members)),
+        left=[float(own[data.judged].square().mean().sqrt()) for own in found.left],
         errors=[float(own[data.judged].abs().max()) for own in data.command - data.position],
         axes=axes,
     )
@@ -172,9 +172,9 @@ def _mass(found: MotionDiagnosis) -> list[float]:
     """What a payload adds to each axis [kg]."""
     library = found.problem.library
     if "payload" not in library.names:
-        return [0.0] * len(found.verdicts)
+        return [0.0] * len(found.followed)
     places = library.places[library.names.index("payload")]
     return [
-        sum(float(v.best.spec.theta[j]) * library.numbers[i][j].scale for j in places)
-        for i, v in enumerate(found.verdicts)
+        sum(float(spec.theta[j]) * library.numbers[i][j].scale for j in places)
+        for i, spec in enumerate(found.followed)
     ]
