@@ -175,6 +175,5 @@ def _mass(found: MotionDiagnosis) -> list[float]:
         return [0.0] * len(found.followed)
     places = library.places[library.names.index("payload")]
     return [
-        sum(float(spec.theta[j]) * library.numbers[i][j].scale for j in places)
-        for i, spec in enumerate(found.followed)
+        sum(float(spec.theta[j]) * library.numbers[i][j].scale for j in places) for i, spec in enumerate(found.followed)
     ]
