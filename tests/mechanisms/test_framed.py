@@ -133,5 +133,5 @@ def test_refusals():
     with pytest.raises(InputError, match="'delta' has no orientation"):
         load_mechanism("framed", mechanism="delta", tool=True)
     arm = SerialArm("arm", "standard", [[0.0, 1.0, 0.2, 0.0], [0.3, 0.0, 0.0, 0.0]])
-    with pytest.raises(InputError, match="called as the frames of .framed. are: base_rx"):
+    with pytest.raises(InputError, match=r"called as the frames of .framed. are: base_rx"):
         Framed(arm)

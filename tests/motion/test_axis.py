@@ -216,6 +216,19 @@ def test_compiled_or_not_an_axis_moves_the_same() -> None:
     torch.testing.assert_close(*ways, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("fast", [True, False])
+def test_a_late_command_that_was_thinned_goes_along_its_curve(fast: bool) -> None:
+    """On straight lines between samples 8 ms apart it was elsewhere by what a spring or an inertia does."""
+    whole = np.arange(0, 3, 1e-3)
+    asked = 0.3 * np.sin(5 * whole + np.sin(3 * whole))
+    late = np.interp(whole - 3.3e-3, whole, asked)[::8]
+    time, command = (torch.from_numpy(v[::8].copy())[None] for v in (whole, asked))
+    drive = Drive(time, command, torch.zeros(1, 2, dtype=torch.float64), bent=torch.tensor([1 - 8.0**-2]).double())
+    given = {"delay": torch.tensor([[3.3e-3]], dtype=torch.float64)}
+    errors = [simulate_axes(d, given, fast)[0, 0].numpy()[8:] - late[8:] for d in (drive, drive._replace(bent=None))]
+    assert np.abs(errors[0]).max() < 5e-6 < 0.1 * np.abs(errors[1]).max()
+
+
 def test_the_last_digit_of_a_command_decides_nothing() -> None:
     sets = [{"cogging_sin": 0.04, "cogging_order": 84.0}, {"stribeck": 0.05, "stribeck_speed": 0.02, "viscous": 0.01}]
     sets += [{"stribeck": 0.1, "coulomb": 0.05, "load_friction": 0.3}, OWN | {"stribeck": 0.1, "stribeck_speed": 0.01}]

@@ -88,6 +88,40 @@ def test_a_simulator_of_ones_own_is_a_model_whose_parameters_are_causes(tmp_path
         diagnose_motion(logs, nominal_of(f"{own}:BROKEN", {}, ["rad"]), ["delay"])
 
 
+LAG = """
+import numpy as np
+class LAG:
+    parameters = {"lag": 0.05}
+    def simulate(self, time, commands, parameters):
+        keep, q = np.exp(-np.diff(time) / parameters["lag"])[:, None], commands.copy()
+        for k in range(1, len(time)):
+            q[k] = commands[k] + (q[k - 1] - commands[k]) * keep[k - 1]
+        return q
+"""
+
+
+def test_an_axis_delays_also_what_a_simulators_parameter_changes(tmp_path: Path) -> None:
+    """The written model leaves on its own log what the file says that it leaves."""
+    own, time = tmp_path / "lag.py", np.arange(0, 8, 0.004)
+    own.write_text(LAG)
+    nominal = nominal_of(f"{own}:LAG", {}, ["rad"])
+    assert nominal.simulator is not None
+    asked = command(0, time)
+    real = Simulator("real", nominal.simulator.simulate, {"lag": 0.065})
+    noise = 1e-5 * np.random.default_rng(1).standard_normal(len(time))
+    moved_so = real.positions(time, np.interp(time - 0.03, time, asked)[:, None])[:, 0]
+    log = tmp_path / "log.csv"
+    write_table(log, {"time[s]": time, "command1[rad]": asked, "q1[rad]": moved_so + noise})
+    found = diagnose_motion(load_logs([log]), nominal, ["delay"])
+    write_identified(tmp_path, found, nominal, {})
+    better = load_identified(tmp_path / "identified_motion.json", allow_code=True)
+    assert better.nominal.simulator is not None and better.effects == ("delay", "parameter lag")
+    assert better.nominal.simulator.parameters["lag"] == pytest.approx(0.065, rel=2e-3)
+    assert better.axes[0]["delay"] == pytest.approx(0.03, abs=2e-4)
+    there = feed_forward.moved(better.nominal, better.axes, time, asked[None, :, None])[0, :, 0]
+    assert np.square(there - moved_so)[50:].mean() ** 0.5 < 3 * better.left[0] < 1e-4
+
+
 def test_a_mujoco_model_is_a_model_and_gets_the_new_values(tmp_path: Path) -> None:
     # A load of 0.3 N m at 90 degrees, where the model has 0.2 kg at 0.1 m.
     real = {"weight": 0.3, "dry": 0.06}
