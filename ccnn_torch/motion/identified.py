@@ -56,7 +56,7 @@ class Identified(NamedTuple):
         nominal: the model with the new values.
         axes: parameters of its axes, with what the model itself does not hold.
         left: RMS that it left on runs that were not fitted, of each joint [rad or m].
-        effects: names of the verdict.
+        effects: names of what it holds: of each axis the set that leaves least of runs that no fit saw.
         units: of the joints.
         errors: largest differences of command and position in the logs, of each joint [rad or m].
         temperature: that at which the model's friction holds [K]; None where none was recorded.
