@@ -51,8 +51,13 @@ def best_to_follow(
     """
     likeliest = [max(fits, key=log_posterior).spec for fits in found.found]
     closest = [min(fits, key=lambda fit: fit.rss).spec for fits in found.found]
-    sets = [[v.best.spec for v in verdicts], likeliest, closest]
-    residuals = torch.cat([left[None], held_out(problem, found.whitening, sets[1:])])
+    sets = [[v.best.spec for v in verdicts]]
+    for other in (likeliest, closest):
+        if all([s.members for s in own] != [s.members for s in other] for own in sets):
+            sets.append(other)
+    residuals = left[None]
+    if sets[1:]:
+        residuals = torch.cat([residuals, held_out(problem, found.whitening, sets[1:])])
     least = residuals[..., problem.data.judged].square().mean(-1).argmin(0).tolist()
     chosen = torch.stack([residuals[k, i] for i, k in enumerate(least)])
     return [sets[k][i] for i, k in enumerate(least)], chosen
