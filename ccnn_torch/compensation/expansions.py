@@ -38,8 +38,14 @@ class ChebyshevExpansion(nn.Module):
     _pick: Tensor
 
     def __init__(self, centre: Tensor, half_range: Tensor, degree: int, outputs: int = 0) -> None:
-        """outputs: how many, as many as joints when 0."""
+        """outputs: how many, as many as joints when 0.
+
+        Raises:
+            ValueError: the polynomial has more terms than any that is fitted.
+        """
         super().__init__()
+        if math.comb(len(centre) + degree, degree) > _MOST_TERMS:
+            raise ValueError(f"a polynomial of degree {degree} of {len(centre)} joints")
         exponents = _exponents(len(centre), degree)
         self.degree, self.outputs = degree, outputs or len(centre)
         self.register_buffer("centre", centre)

@@ -457,6 +457,14 @@ def test_a_machine_that_would_compute_for_ever_is_refused(with_machine: Path, pl
         load_model(path)
 
 
+def test_a_polynomial_of_endless_terms_is_refused(with_machine: Path) -> None:
+    """Each number is a possible one, and all together are no model."""
+    facts = fingerprint(with_machine)
+    facts["machine"] |= {"kind": "expanded", "joints": 60, "degrees": [60, 60, 60], "turns": True, "effects": None}
+    with pytest.raises(ModelFileError, match=r"not those that its metadata lists \(a polynomial of degree 60 of 60"):
+        load_model(forge_master(with_machine, facts, lambda tensors: None))
+
+
 def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()\n")
     spec = f"{tmp_path / 'own.py'}:Own"
