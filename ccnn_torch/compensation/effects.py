@@ -93,7 +93,7 @@ class Fields(nn.Module):
 
     def fill(self, situation: Situation) -> Situation:
         """The same situation with everything that effects look at in it; fresh, with joints `s x n`."""
-        values: dict[str, Any] = dict(self.values(situation.joints, {name for name, _ in self.layout}))
+        values: dict[str, Any] = dict(self.values(situation.joints))
         if _POSITION in values:
             values["platform"] = values.pop(_POSITION), values.pop(_ROTATION, None)
         constants = {
@@ -106,9 +106,9 @@ class Fields(nn.Module):
         situation.__dict__.update(values | constants)
         return situation
 
-    def values(self, joints: Tensor, names: set[str]) -> dict[str, Tensor]:
-        """Some of the quantities at joints `s x n`, each `s x shape`."""
-        machine = self._samples[0].mechanism
+    def values(self, joints: Tensor) -> dict[str, Tensor]:
+        """The quantities at joints `s x n`, each `s x shape`."""
+        machine, names = self._samples[0].mechanism, {name for name, _ in self.layout}
         if isinstance(machine, SerialArm):
             return _of_arm(machine, joints, names)
         if self.source is None:
@@ -119,8 +119,7 @@ class Fields(nn.Module):
         out, start = {}, 0
         for name, shape in self.layout:
             end = start + math.prod(shape)
-            if name in names:
-                out[name] = flat[..., start:end].reshape(*joints.shape[:-1], *shape)
+            out[name] = flat[..., start:end].reshape(*joints.shape[:-1], *shape)
             start = end
         return out
 

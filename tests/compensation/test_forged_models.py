@@ -469,20 +469,9 @@ def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) 
     (tmp_path / "own.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()\n")
     spec = f"{tmp_path / 'own.py'}:Own"
     for mechanism, acting in (({"spec": spec, "keys": {}, "parameters": {}}, []), (None, [[spec, 0, 0]])):
-        effects = {
-            "mechanism": mechanism or load_mechanism("tripod").describe(),
-            "covariates": [],
-            "acting": acting,
-            "fields": {},
-            "numbers": {},
-        }
-        machine = {
-            "kind": "forward",
-            "mechanism": effects["mechanism"],
-            "identified": [],
-            "effects": effects if acting else None,
-            "rule": {},
-        }
+        about = {"mechanism": mechanism or load_mechanism("tripod").describe()}
+        effects = about | {"covariates": [], "acting": acting, "fields": {}, "numbers": {}} if acting else None
+        machine = about | {"kind": "forward", "identified": [], "effects": effects, "rule": {}}
         path = forge_master(copied, fingerprint(copied) | {"machine": machine}, lambda tensors: None)
         with pytest.raises(ModelFileError, match=r"names Python code, .*own\.py:Own, which would run.*=True"):
             load_model(path)
