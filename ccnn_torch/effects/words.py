@@ -39,7 +39,8 @@ _WORDS = {
         "error motion of the axis",
         "Shift along x, y, z and turn about x, y, z of what the joint carries: of a sliding joint by Legendre's "
         "polynomial of that degree less the one two degrees lower, from one end of its travel (-1) to the other (1), "
-        "of a turning one by the sine or cosine of its angle, or of twice that.",
+        "of a turning one by the sine or cosine of its angle, or of twice that. Of a motion how much further the joint "
+        "goes, times the square and the third power of its position.",
         "Guides and bearings of {where}: their alignment, their bed, and the load on them.",
     ),
     "joint_offset": Words(
@@ -59,7 +60,7 @@ _WORDS = {
         "a periodic error of the transmission",
         "harmonic error",
         "The joint is off by sin · sin(n q) + cos · cos(n q): q is its command, n the times a turn (of a sliding joint "
-        "2π over the length).",
+        "2π over the length; of a motion it is lead_order).",
         "Gear, belt, screw or encoder of {where}: eccentric, worn or badly mounted.",
     ),
     "backlash": Words(
@@ -183,6 +184,12 @@ _WORDS = {
         "wrong servo gain",
         "How much higher the proportional gain is than in the model. A lag: 1 over the velocity gain.",
         "Proportional and velocity gain of {where} in the drive and in the model.",
+    ),
+    "feedforward": Words(
+        "another feedforward of speed than is set",
+        "wrong feedforward",
+        "How much larger the share of the command's speed is than in the model, and how much later it comes.",
+        "Feedforward of speed of {where} in the drive and in the model, and whether the drive filters it.",
     ),
     "integral_action": Words(
         "integral action of the position control",

@@ -40,7 +40,7 @@ def course(
     if has.slowness or has.ramp:
         u = _limited(axis, step, u, q, v, push[0])
     if has.derivative:
-        u = _led(axis, step, u)
+        u = _led(axis, step, u, bent)
     state = begun(axis, start, push[0])
     found, driven = np.empty_like(u), axis.own.encoder_at_motor > 0
     found[0] = pick(driven, state.q, state.x)
@@ -63,14 +63,26 @@ def course(
             parts,
         )
         found[k + 1] = pick(driven, state.q, state.x) if has.flexibility else state.q
-    if not has.play:
-        return found
-    behind = _played(axis, found)
-    if has.play_loaded:
-        hung = _hung(axis, step, found, push)
-        for k in range(len(hung)):
-            behind[k] = pick(axis.own.play_loaded > 0, hung[k], behind[k])
-    return behind
+    if has.play:
+        behind = _played(axis, found)
+        if has.play_loaded:
+            hung = _hung(axis, step, found, push)
+            for k in range(len(hung)):
+                behind[k] = pick(axis.own.play_loaded > 0, hung[k], behind[k])
+        found = behind
+    if has.lead_square or has.lead_cube or has.lead_sin or has.lead_cos:
+        for k in range(len(found)):
+            found[k] = _geared(axis, found[k])
+    return found
+
+
+@compilable
+def _geared(axis: Axis, q: Array) -> Array:
+    """Where a gear or screw of uneven transmission is, where an even one is at `q`."""
+    own, angle = axis.own, axis.own.lead_order * q
+    smooth = np.square(q) * (own.lead_square + own.lead_cube * q)
+    found: Array = q + smooth + own.lead_sin * np.sin(angle) + own.lead_cos * np.cos(angle)
+    return found
 
 
 @compilable
@@ -105,18 +117,25 @@ def _limited(axis: Axis, step: Array, u: Array, q: Array, v: Array, push: Array)
 
 
 @compilable
-def _led(axis: Axis, step: Array, u: Array) -> Array:
-    """Commands with what a derivative gain adds to them; less what the integral action would make of that, which
-    integrates the commands alone."""
+def _led(axis: Axis, step: Array, u: Array, bent: Array) -> Array:
+    """Commands with what a derivative gain adds to them; less what the integral action would make of that, which but
+    in a cascade integrates the commands alone."""
     found, last = u.copy(), len(step) - 1
-    lead = before = 0.0 * u[0]
+    lead = before = fed = 0.0 * u[0]
+    alone = (axis.own.integral > 0) & (axis.own.cascade == 0)
     for k in range(len(u)):
         a, b = max(k - 1, 0), min(k, last)
         between = step[b] if a == b else step[a] + step[b]
-        now = axis.own.derivative * (u[b + 1] - u[a]) / between
+        rate = u[b + 1] - u[a]
+        if 1 < k < last:
+            # Of fourth order, where samples were left out of a command that is smooth there.
+            rate = rate - bent * (u[k + 2] - u[k - 2] - 2 * rate) / 6
+        share = step[a] / (step[a] + axis.own.forward_lag)
+        fed = pick(k > 0, fed + share * (rate / between - fed), rate / between)
+        now = axis.own.derivative * axis.own.forward * fed
         fades = 0.5 * axis.own.integral * step[a]
         faded = (lead * (1 - fades) + now - before) / (1 + fades)
-        lead = pick((axis.own.integral > 0) & (k > 0), faded, now)
+        lead = pick(alone & (k > 0), faded, now)
         before = now
         found[k] = u[k] + lead
     return found

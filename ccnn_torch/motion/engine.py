@@ -175,8 +175,8 @@ def _diagnosed(
 # A run is apart that leaves so many times as much as any other, of so many at least.
 _APART, _FEWEST_RUNS = 4.0, 3
 # Of shapes that are no speed.
-_SHAPE_UNITS = {"cogging_order": "order", "play_friction": "acceleration"} | dict.fromkeys(
-    ("flexible_damping", "play_loaded", "encoder_at_motor"), "1"
+_SHAPE_UNITS = {"cogging_order": "order", "lead_order": "order", "play_friction": "acceleration"} | dict.fromkeys(
+    ("flexible_damping", "play_loaded", "encoder_at_motor", "cascade"), "1"
 )
 # A limit that is so far away is none.
 _TINY = 1e-9

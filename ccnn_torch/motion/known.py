@@ -9,7 +9,18 @@ from ccnn_torch.spelling import nearest_hint
 from ccnn_torch.units import amount
 
 TIME, _WEIGHT = "time", ("gravity_sin", "gravity_cos")
-_SAME = ("gain", "integral", "derivative", "inertia", "viscous", "coulomb", "load_friction", "stribeck", "delay")
+_SAME = (
+    "gain",
+    "integral",
+    "derivative",
+    "forward",
+    "inertia",
+    "viscous",
+    "coulomb",
+    "load_friction",
+    "stribeck",
+    "delay",
+)
 OF: dict[str, tuple[str, ...]] = {name: (name,) for name in _SAME} | {"mass": _WEIGHT, "torque_limit": ("weakness",)}
 """What of a model may be off, by its key, and the parameters of an axis that it is; of the load's mass its weight."""
 VALUE = 0.03

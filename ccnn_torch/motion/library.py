@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -23,23 +24,23 @@ from ccnn_torch.spelling import nearest_hint
 # What may not be below 0, and what not above.
 _POSITIVE = (
     *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "fading", "slowness", "ramp", "play"),
-    *("dead_band", "flexibility", "gain", "integral", "derivative", "supply"),
+    *("dead_band", "flexibility", "gain", "integral", "derivative", "forward", "forward_lag", "supply"),
 )
 # With more damping a spring is no spring; a motor is no stronger than its voltage, but for an error of that.
 _MOST = {"load_friction": 0.9, "flexible_damping": 0.3, "supply": 1.5}
 # Share of the largest speed up to which friction may fall with the speed: what falls later is plain dry friction.
 _SLOW = 0.5
 # A spring without any damping never comes to rest.
-_LEAST = {"cogging_order": FEWEST, "flexible_damping": 1e-3}
+_LEAST = {"cogging_order": FEWEST, "lead_order": 1.0, "flexible_damping": 1e-3}
 # Plausible sizes up to which a simulator is linear in its own parameters.
 _REACH = 0.6
 # Plausible sizes: no number is larger.
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
-_RARER = dict.fromkeys(("stribeck", "cogging", "dead_band", "acceleration_limit"), math.log(0.1))
+_RARER = dict.fromkeys(("stribeck", "cogging", "transmission", "dead_band", "acceleration_limit"), math.log(0.1))
 _SMALLEST = 1e-6
 # Shapes that a fit refines from where they begin.
-_REFINED = ("cogging_order", "stribeck_speed", "flexible_damping", "play_friction")
+_REFINED = ("cogging_order", "lead_order", "stribeck_speed", "flexible_damping", "play_friction")
 
 
 class Variant(NamedTuple):
@@ -68,7 +69,8 @@ class Library(NamedTuple):
     """Effects of `n` axes whose numbers, in plausible sizes, stand in vectors of `k`.
 
     Attributes:
-        names: of the effects that are tried.
+        effects: that are tried.
+        names: of these.
         facts: of each axis.
         numbers: of each axis, those of every effect one after the other; shapes that are held have none.
         size: `k`.
@@ -84,6 +86,7 @@ class Library(NamedTuple):
         about: what is added to each of a simulator's own parameters where it was linearised.
     """
 
+    effects: tuple[MotionEffect, ...]
     names: tuple[str, ...]
     facts: tuple[Facts, ...]
     numbers: tuple[tuple[Number, ...], ...]
@@ -122,6 +125,11 @@ class Library(NamedTuple):
         if "stribeck_speed" in self.held:
             high[:, self.held["stribeck_speed"]] = torch.tensor([_SLOW * axis.speed for axis in self.facts])
         return low, high
+
+    def repeating(self, ripples: Sequence[tuple[float, ...]]) -> Library:
+        """The same with other periods, of each axis, from which a fit of a wave may begin."""
+        facts = [replace(own, ripples=others) for own, others in zip(self.facts, ripples, strict=True)]
+        return library_of(self.effects, facts)._replace(about=self.about)
 
     def parameters(self, theta: Tensor, axis: Tensor) -> dict[str, Tensor]:
         """Parameters of axes.
@@ -260,6 +268,7 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
         if any(axis.nominal.get(name, value) != value for axis in facts)
     }
     return Library(
+        tuple(effects),
         tuple(effect.name for effect in effects),
         tuple(facts),
         tuple(map(tuple, numbers)),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Sequence
+from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple
 
@@ -18,10 +19,13 @@ from ccnn_torch.motion.descent import sensitivities, white_residual
 from ccnn_torch.motion.fit import fit_many, form_errors, products, side_by_side, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.ripples import left_ripples
 from ccnn_torch.motion.servo import TORQUES
 from ccnn_torch.motion.spec import Fit, Spec, nothing, started, without
 from ccnn_torch.motion.whiten import Whitening, fitted_whitening, white_noise
 
+# What a loop and a rigid body may have wrong.
+_COMMON = ("servo_gain", "feedforward", "joint_gain", "inertia", "coulomb", "flexible_joint")
 # Sets that are extended, effects that are fitted for each of them after the screen, and members at most.
 _BEAM, _FITTED, _MOST = 2, 4, 9
 # Decimals of a log evidence up to which sets do the same.
@@ -84,7 +88,10 @@ def search(problem: Problem) -> Search:
     plain = _Pool(fewest, white_noise(n))
     # Before it is whitened a residual has the fewest local optima.
     plain.forward()
+    plain.backward()
+    plain.forward()
     largest = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
+    problem, few, fewest = (_repeating(one, problem, largest) for one in (problem, few, fewest))
     pool = _Pool(fewest, fitted_whitening(problem.pooled(largest), problem.judged))
     pool.again(plain)
     pool.forward()
@@ -106,6 +113,13 @@ def search(problem: Problem) -> Search:
     return Search(
         problem, final.whitening, tuple(tuple(p) for p in final.ranked()), largest, tuple(form), final.nuisance
     )
+
+
+def _repeating(problem: Problem, whole: Problem, left: Tensor) -> Problem:
+    """The problem, some of the whole one, with waves as they repeat in what a model leaves of that, `n x b x s`."""
+    data = whole.data
+    each = zip(*(v[:, data.judged] for v in (left, data.position, data.speed)), strict=True)
+    return replace(problem, library=problem.library.repeating([left_ripples(*own) for own in each]))
 
 
 def _level(score: float) -> float:
@@ -215,6 +229,34 @@ class _Pool:
             gains = [a >= b + _GAINED for a, b in zip(after, before, strict=True)]
             if not any(gains):
                 return
+
+    def backward(self) -> None:
+        """From the most probable set with all beside it that a loop may have wrong, less and less, as long as that
+        brings evidence: where two of these are nothing without each other, one after the other finds neither."""
+        now = []
+        variances = [self.noise_of(i) for i in range(self.axes)]
+        pairs = [(i, f.spec) for i, f in enumerate(self.best())]
+        for (i, spec), found in zip(
+            pairs, promises(self.problem, self.whitening, pairs, self.nuisance, variances), strict=True
+        ):
+            first: dict[int, tuple[float, Variant]] = {}
+            for score, variant in found:
+                if self.library.names[variant.effect] in _COMMON and score > first.get(variant.effect, (-math.inf,))[0]:
+                    first[variant.effect] = score, variant
+            for _, variant in first.values():
+                spec = started(spec, variant, i)
+            now.append(spec)
+        self.fit([[s] for s in now], _LONG)
+        fits, going = [self.found[i][s.members] for i, s in enumerate(now)], [True] * self.axes
+        while any(going):
+            less = self.fewer(
+                [f.spec if on else nothing(self.library) for f, on in zip(fits, going, strict=True)], _SHORT
+            )
+            best = [max(own, key=log_posterior, default=f) for own, f in zip(less, fits, strict=True)]
+            going = [
+                len(f.members) > 1 and log_posterior(b) > log_posterior(f) for b, f in zip(best, fits, strict=True)
+            ]
+            fits = [b if on else f for b, f, on in zip(best, fits, going, strict=True)]
 
     def explored(self) -> list[list[Spec]]:
         """The likely sets of each axis, and every effect alone: sets near those that are the most probable."""

@@ -16,6 +16,12 @@ KEYS: dict[str, str] = {
     "gain": "proportional gain; without it torques are told as angles [N*m/rad]",
     "integral": "integral gain over the proportional one, 1 over the integral time [1/s]",
     "derivative": "derivative gain, of command less position, over the proportional one [s]",
+    "forward": "share of the command's speed in that; of a cascade its feedforward of speed, 1 without the key [1]",
+    "forward_lag": "time constant of that share [s]",
+    "cascade": "1 where the integral is of the speed's error as well, as in a cascade; set by speed_gain [1]",
+    "position_gain": "of a cascade, in the place of derivative [1/s]",
+    "speed_gain": "of a cascade, in the place of gain: torque by error of speed [N*m*s/rad]",
+    "integral_time": "of the speed's error, in the place of integral [s]",
     "inertia": "of the axis about its own axis, without mass * length^2 of its load [kg*m^2]",
     "load_inertia": "part of inertia that is behind a play or flexible joint; without it and mass all is [kg*m^2]",
     "mass": "of the load at the end of its lever, which hangs down at 0 [kg]",
@@ -33,6 +39,11 @@ KEYS: dict[str, str] = {
     "flexibility": "inertia of the driven side over the stiffness of the joint [s^2]",
     "flexible_damping": "damping ratio of that spring [1]",
     "encoder_at_motor": "1 where the encoder is at the motor, and that spring behind it [1]",
+    "lead_square": "by how much the position goes further, times its square [1/rad]",
+    "lead_cube": "the same with its third power [1/rad^2]",
+    "lead_sin": "wave of gear or screw: the same with the sine of lead_order times the position [rad]",
+    "lead_cos": "the same with the cosine [rad]",
+    "lead_order": "periods of that wave in a turn; of a sliding axis 2 pi over the lead [1]",
     "thermal": "change of coulomb for each kelvin above the coldest sample of the logs, as a share of it [1/K]",
     "delay": "from command to motor [s]",
     "offset": "of the position from the command [rad]",
@@ -52,7 +63,9 @@ KEYS: dict[str, str] = {
 
 TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos"),)
 """Parameters that are torques, which an axis has over the gain."""
-_SIGNED = ("delay", "offset", "ratio", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
+_LEAD = ("lead_square", "lead_cube", "lead_sin", "lead_cos")
+_SIGNED = ("delay", "offset", "ratio", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal", *_LEAD)
+_CASCADE = ("position_gain", "speed_gain")
 _OTHERWISE = {"backlash": "play", "backlash_loaded": "play_loaded", "backlash_friction": "play_friction"}
 # What an axis has as the servo does.
 _SAME = {key: key for key in KEYS if key in ABSENT and key not in (*TORQUES, "gain", "supply")} | _OTHERWISE
@@ -78,7 +91,7 @@ def servo(keys: Mapping[str, Any], n: int) -> Nominal:
     each = {key: _numbers(key, value, n) for key, value in keys.items()}
     axes, gains, lengths, masses = [], [], [], []
     for i in range(n):
-        own = {key: values[i] for key, values in each.items()}
+        own = _of_cascade({key: values[i] for key, values in each.items()})
         gain = own.get("gain")
         needs = [k for k in (*TORQUES, "load_inertia", "mass", "torque_limit") if own.get(k)]
         if gain is None and needs:
@@ -105,6 +118,28 @@ def servo(keys: Mapping[str, Any], n: int) -> Nominal:
         masses.append(load)
     supply = each["supply"][0] if each.get("supply") else None
     return Nominal("servo", tuple(axes), tuple(gains), tuple(lengths), supply, masses=tuple(masses))
+
+
+def _of_cascade(own: dict[str, float]) -> dict[str, float]:
+    """Keys of one axis with those of a cascade told as gain, derivative and integral.
+
+    kv (kp (u - q) + f u' - q') and its integral over a time are kv kp times what PID makes of u - q, but that the
+    integral is of all of it.
+    """
+    given = [key for key in (*_CASCADE, "integral_time") if key in own]
+    if not given:
+        return own
+    other = {"position_gain": "derivative", "speed_gain": "gain", "integral_time": "integral"}
+    twice = next((key for key in given if other[key] in own), None)
+    if twice is not None:
+        raise InputError(f"mechanism_keys: give {twice} or {other[twice]}, not both: one tells the other")
+    lacking = next((key for key in _CASCADE if key not in own), None)
+    if lacking is not None:
+        raise InputError(f"mechanism_keys: {given[0]} is of a cascade, which needs {lacking} as well")
+    kp, kv = own["position_gain"], own["speed_gain"]
+    found = {key: value for key, value in own.items() if key not in other}
+    integral = {"integral": 1 / own["integral_time"]} if "integral_time" in own else {}
+    return found | integral | {"gain": kp * kv, "derivative": 1 / kp, "cascade": 1.0}
 
 
 def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequence[float]) -> dict[str, Any]:
@@ -137,7 +172,7 @@ def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequ
 
 def _numbers(key: str, value: Any, n: int) -> list[float]:
     values = value if isinstance(value, list | tuple) else [value] * n
-    signed, above = key in _SIGNED, key in ("gain", "supply", "length")
+    signed, above = key in _SIGNED, key in ("gain", "supply", "length", *_CASCADE, "integral_time")
     fine = len(values) == n and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and (signed or v >= 0)
         for v in values

@@ -41,6 +41,9 @@ class Given(NamedTuple):
     gain: Any = 1.0
     integral: Any = 0.0
     derivative: Any = 0.0
+    forward: Any = 1.0
+    forward_lag: Any = 0.0
+    cascade: Any = 0.0
     inertia: Any = 0.0
     load: Any = 0.0
     viscous: Any = 0.0
@@ -70,6 +73,11 @@ class Given(NamedTuple):
     flexibility: Any = 0.0
     flexible_damping: Any = 0.1
     encoder_at_motor: Any = 0.0
+    lead_square: Any = 0.0
+    lead_cube: Any = 0.0
+    lead_sin: Any = 0.0
+    lead_cos: Any = 0.0
+    lead_order: Any = 1.0
 
 
 ABSENT: dict[str, float] = Given()._asdict()
@@ -123,13 +131,15 @@ class State(NamedTuple):
 
 class _Fixed(NamedTuple):
     """Of one sample: length of a stage, gain (with what the integral adds to it within the stage), rate of the
-    integral, limit and dry friction, inertia and resistance over the length, stiffness; of a flexible joint its inertia
+    integral, what that adds to the damping (of a cascade), limit and dry friction, inertia and resistance over the
+    length, stiffness; of a flexible joint its inertia
     and its damping over the stage, over its stiffness, and the share of a speed of the motor that its load follows
     with."""
 
     h: Array
     gain: Array
     rate: Array
+    damped: Array
     limit: Array
     dry: Array
     mass: Array
@@ -219,9 +229,14 @@ def begun(axis: Axis, start: Array, push: Array) -> State:
         + axis.own.coulomb * start[12]
     )
     added = start[16] + (axis.own.offset + axis.own.ratio * start[13]) * start[17] - axis.own.delay * start[18]
+    # Of the derivative part: what is fed forward of the command's speed, less the speed; in a cascade its integral.
+    led = axis.own.derivative * (axis.own.forward - 1) * start[11]
+    wound = axis.own.derivative * (axis.own.forward * start[18] - (start[0] - start[14]))
+    added = added + axis.own.cascade * wound
     # What is integrated too slowly for that holds nothing.
     held = 1 - np.exp(-_STOOD * axis.own.integral)
-    held = held * (load + start[15] - axis.own.gain * ((1 + axis.own.ratio) * start[13] + axis.own.offset - start[14]))
+    error = (1 + axis.own.ratio) * start[13] + axis.own.offset - start[14] + led
+    held = held * (load + start[15] - axis.own.gain * error)
     held = held + axis.own.gain * axis.own.integral * added
     held = pick(axis.own.integral > 0, within(held, axis.limit), 0.0 * q)
     at_motor = axis.own.encoder_at_motor > 0
@@ -283,7 +298,9 @@ def _fixed(axis: Axis, has: Given, given: Sample, parts: int) -> _Fixed:
         light = light + axis.stiffness * drag * (1 - follows)
     rate = gain * axis.own.integral
     gain = gain + rate * h
-    return _Fixed(h, gain, rate, limit, dry, mass, np.maximum(light, TINY), gain * h, over, drag, follows)
+    damped = rate * h * axis.own.derivative * axis.own.cascade
+    light = np.maximum(light + damped, TINY)
+    return _Fixed(h, gain, rate, damped, limit, dry, mass, light, gain * h, over, drag, follows)
 
 
 @compilable
@@ -337,9 +354,10 @@ def _stage(axis: Axis, has: Given, fixed: _Fixed, state: State, u: Array, push: 
     speed = _solved(axis, has, free, motor, friction, carried, light, stiff)
     if has.weakness:
         # The part of the damping that the drive makes is within its limit, which falls with the speed.
-        torque = motor - (stiff + axis.drive_damping - axis.line) * speed
+        damping = axis.drive_damping + fixed.damped - axis.line
+        torque = motor - (stiff + damping) * speed
         most = within(torque, limit)
-        lighter = np.maximum(light - axis.drive_damping + axis.line, TINY)
+        lighter = np.maximum(light - damping, TINY)
         weak = _solved(axis, has, free, most, friction, carried, lighter, 0.0 * most)
         speed = pick(torque == most, speed, weak)
     speed = within(speed, _FASTEST)
@@ -349,7 +367,8 @@ def _stage(axis: Axis, has: Given, fixed: _Fixed, state: State, u: Array, push: 
         x = x + h * w
     if has.integral:
         # Beyond the limit of the motor it stands still (anti-windup).
-        held = within(held + fixed.rate * h * _error(axis, has, u - end), limit)
+        held = held + fixed.rate * h * _error(axis, has, u - end) - fixed.damped * speed
+        held = within(held, limit)
     return State(end, speed, x, w, held)
 
 

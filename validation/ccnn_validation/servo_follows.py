@@ -10,9 +10,9 @@ runs that are sent once: S-curves to other places at other speeds, a sweep of si
 All know the data sheet: gains, feedforward, masses, friction, lead. "shifted" sends the commands earlier by the mean
 lag. "regression" is what the command is beyond the measured motion, as a linear function of that. "plain script" fits
 a simulated cascade by least squares and iterates its error away. Ours: `ccnn diagnose --motion`, `ccnn compensate` with
-the mechanism servo without keys ("ours, bare"), with those of the data sheet ("ours, keys"; "no integral" leaves out
-that of the speed loop, since the servo's is of the position alone), and with simulators in Python ("linear cascade",
-and "cascade" with dry friction and delays). Told: RMS / peak in the plane of each run [µm], and the RMS of x and y.
+the mechanism servo without keys ("ours, bare"), with those of the data sheet ("ours, keys"; "set" also says that the
+gains, which are set, are exact), and with simulators in Python ("linear cascade", and "cascade" with dry friction and
+delays). Told: RMS / peak in the plane of each run [µm], and the RMS of x and y.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ KP, KV, TI, FORWARD, MOTOR, TABLE, VISCOUS, COULOMB, LEAD = 60.0, 56e3, 8e-3, 0.
 NOISE, COUNT = 1e-7, 1e-7
 CAUSES = ("mass", "forward", "friction", "soft", "play", "delay", "lead", "cogging")
 KEYS = (
-    "mechanism_keys={{gain: {:.6g}, integral: {:.6g}, derivative: {:.6g}, inertia: {:g}, viscous: {:.6g}, "
-    "coulomb: {:g}}}"
+    f"mechanism_keys={{position_gain: {KP}, speed_gain: {KV}, integral_time: {TI}, forward: {FORWARD}, "
+    f"inertia: {MOTOR + TABLE}, viscous: {VISCOUS}, coulomb: {COULOMB}}}"
 )
 SIMULATOR = '''"""Two axes under a cascade: position gain, feedforward of speed, PI of the speed."""
 import numba
@@ -329,16 +329,6 @@ def plain_script(runs: list[Array], seen: list[Array], new: list[Array]) -> list
     return corrected
 
 
-def keys(integral: bool) -> str:
-    """The cascade by the data sheet as keys of the servo, from the sum of the terms of the motor's force."""
-    if not integral:
-        return KEYS.format(KV * KP, 0, FORWARD / KP, MOTOR + TABLE, VISCOUS + KV * (1 - FORWARD), COULOMB)
-    gain = KV * (KP + FORWARD / TI)
-    return KEYS.format(
-        gain, KV * KP / TI / gain, KV * FORWARD / gain, MOTOR + TABLE, VISCOUS + KV * (1 - FORWARD), COULOMB
-    )
-
-
 def ours(folder: Path, name: str, runs: list[Array], seen: list[Array], new: list[Array]) -> list[Array] | None:
     """Commands of `ccnn diagnose --motion` and `ccnn compensate`; None where there are none."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -350,7 +340,7 @@ def ours(folder: Path, name: str, runs: list[Array], seen: list[Array], new: lis
     np.savetxt(folder / "motion.csv", many, "%.8g", ",", header=f"run[1],time[s],{motion}", comments="")
     (folder / "stage.py").write_text(SIMULATOR)
     contestant = Contestant(folder, "diagnose")
-    choices = {"bare": ["servo"], "keys": ["servo", keys(True)], "no integral": ["servo", keys(False)]}
+    choices = {"bare": ["servo"], "keys": ["servo", KEYS], "set": ["servo", KEYS, "exact=[gain, derivative, integral]"]}
     options = (choices | {"linear cascade": ["stage.py:STAGE"], "cascade": ["stage.py:CASCADE"]})[name]
     options = ["--mechanism", options[0], "--out", "found", *options[1:]]
     start = clock.time()
@@ -405,7 +395,7 @@ def main() -> None:
     options.add_argument("--stages", type=int, default=1)
     options.add_argument("--without", choices=("", *CAUSES), default="", help="a cause that is switched off")
     options.add_argument("--keep", type=Path, help="folder of the files; by default a temporary one")
-    options.add_argument("--ours", default="bare,keys,no integral,linear cascade,cascade")
+    options.add_argument("--ours", default="bare,keys,set,linear cascade,cascade")
     given = options.parse_args()
     folder = given.keep or Path(mkdtemp())
     folder.mkdir(parents=True, exist_ok=True)

@@ -9,6 +9,8 @@ _LEAST_CHANGE = 0.03
 # Share of the motor's limit from which a wrong nominal voltage shows.
 _NEAR_LIMIT = 0.5
 _PROPORTIONAL, _DERIVATIVE = "proportional gain", "derivative gain"
+# Integral gains that are tried [1/s], and whether they are of a cascade.
+_INTEGRALS = ((0.3, 0.0), (3.0, 0.0), (30.0, 1.0), (100.0, 1.0))
 _SHARE, _VOLTAGE = "share of the voltage's change", "motor's strength"
 
 
@@ -69,6 +71,24 @@ DELAY = MotionEffect("delay", lambda axis: (Number("delay", "s", 0.02, (add("del
 # Of an axis of which nothing is known the proportional gain has nothing to work against; a finite gain is then a lag.
 SERVO_GAIN = MotionEffect("servo_gain", _gains, _either_gain)
 
+
+def _fed(axis: Facts) -> tuple[Number, ...]:
+    lag = Number("lag", "s", 0.002, (add("forward_lag"),))
+    if not axis.driven:
+        # Of an axis of which nothing is known: time for which the command is sent ahead of itself.
+        return Number("command's speed", "s", 0.03, (add("derivative"),)), lag
+    return Number("share of the command's speed", "1", 0.05, (add("forward"),), 0.0), lag
+
+
+# The drive feeds forward another share of the command's speed than was set, or later.
+FEEDFORWARD = MotionEffect(
+    "feedforward",
+    _fed,
+    missing=lambda axis: (
+        "" if not axis.driven or axis.nominal.get("derivative") else "a derivative gain or a cascade in the model"
+    ),
+)
+
 # Position and command differ by a constant.
 OFFSET = MotionEffect("offset", lambda axis: (Number("offset", "joint", 0.02, (add("offset"),), 0.0),))
 
@@ -86,7 +106,8 @@ DEAD_BAND = MotionEffect(
 INTEGRAL_ACTION = MotionEffect(
     "integral_action",
     lambda axis: (Number("integral gain", "1/s", 1.0, (add("integral"),)),),
-    lambda axis: [{"integral gain": start} for start in (0.3, 3.0)],
+    # Of the position alone, or of a cascade's error of speed.
+    lambda axis: [{"integral gain": start, "cascade": kind} for start, kind in _INTEGRALS],
 )
 
 # A limit of the motor's torque, which falls with the speed as its voltage does not suffice for more.

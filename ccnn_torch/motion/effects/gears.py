@@ -49,6 +49,31 @@ FLEXIBLE_JOINT = MotionEffect(
     ],
 )
 
+
+def _waves(axis: Facts) -> list[dict[str, float]]:
+    # Eccentric wheels, once and twice a turn, and what the logs show.
+    usual = (1.0, 2.0) if axis.unit == "rad" else (4 * math.pi / axis.span,)
+    return [{"lead_order": order} for order in (*usual, *axis.ripples)]
+
+
+# Gear or screw whose position returns to an error with each turn: behind the drive, which does not see it.
+TRANSMISSION = MotionEffect(
+    "transmission",
+    lambda axis: tuple(
+        Number(wave, "joint", 0.002 * axis.span, (add(f"lead_{wave}"),), 0.0) for wave in ("sin", "cos")
+    ),
+    _waves,
+)
+
+# The same without a return: a screw that is worn or warm in its middle, a scale that is stretched unevenly.
+ERROR_MOTION = MotionEffect(
+    "error_motion",
+    lambda axis: (
+        Number("square", f"1/{axis.unit}", 0.01 / axis.span, (add("lead_square"),), 0.0),
+        Number("cube", f"1/{axis.unit}^2", 0.02 / axis.span**2, (add("lead_cube"),), 0.0),
+    ),
+)
+
 # Cogging of the motor, teeth of a gear.
 COGGING = MotionEffect(
     "cogging",

@@ -24,7 +24,7 @@ class Facts:
         speed: nearly the largest one [per s].
         error: nearly the largest difference of command and position [rad or m].
         supply, temperature: largest relative change of the supply voltage, and of the temperature [K], in the logs.
-        ripples: periods in a turn (in 2 pi m) that a torque seems to repeat with.
+        ripples: periods in a turn (in 2 pi m) that a torque, or the position, seems to repeat with.
     """
 
     unit: str

@@ -18,11 +18,12 @@ EFFECTS: dict[str, MotionEffect] = {
         *(bodies.GRAVITY, bodies.PAYLOAD, bodies.INERTIA),
         *(friction.VISCOUS, friction.COULOMB, friction.STRIBECK, gears.BACKLASH, gears.FLEXIBLE_JOINT),
         *(control.SPEED_LIMIT, control.SATURATION, control.SUPPLY, gears.COGGING, friction.THERMAL_FRICTION),
-        *(control.INTEGRAL_ACTION, control.DEAD_BAND, control.ACCELERATION_LIMIT),
+        *(control.INTEGRAL_ACTION, control.DEAD_BAND, control.ACCELERATION_LIMIT, control.FEEDFORWARD),
+        *(gears.TRANSMISSION, gears.ERROR_MOTION),
     )
 }
 
-EXACT = frozenset({"delay", "servo_gain", "offset", "joint_gain", "gravity", "payload", "inertia"})
+EXACT = frozenset({"delay", "servo_gain", "feedforward", "offset", "joint_gain", "gravity", "payload", "inertia"})
 """Effects whose form is that of rigid bodies and of the control loop; friction, play and limits differ from theirs."""
 
 OWN = "own "
