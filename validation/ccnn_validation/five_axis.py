@@ -2,16 +2,17 @@
 
 `python -m ccnn_validation.five_axis --seed N [--machines N] [--rows N]`. Four spheres on a certified plate on the
 table (0.5 µm); the device tells where a sphere is in the tool's axes, 1 µm of noise in each. Which sphere, and the
-device's reading, give the tool's place seen from the plate. Told beside it: temperatures of bed, spindle and the three
+device's reading, give the tool's place seen from the plate. Told beside it: temperatures of bed, spindle and
 screws, and direction of approach. The true machine: errors of place and direction of A and C, squarenesses, leads and
 what they leave, screws of 10 mm lead, guides that are not straight and pitch, yaw and roll over Abbe arms, a worm of
 90 teeth with ripple and play at A, an encoder on C that is not central, growth of spindle, bed and screws, and a
 trunnion that gives under table and workpiece as A tilts. Ours (`ccnn run`, by the written file) has the machine file
-that `ccnn new` writes; "gears" also knows leads and teeth, "sheet" also tolerances and travel by the data sheet.
+that `ccnn new` writes; "gears" also knows leads and teeth, "sheet" also tolerances and travel by the data sheet, "no
+bed" lacks the bed's temperature, "named" is told in `effects` which act.
 The plain SciPy script has the errors of the axes' places, leads, growth and the worm's play; "fuller script" all causes
-with a polynomial or wave for each. Both correct X, Y, Z. Judged in the workpiece's frame and at the tool point that suit
-best: RMS, and largest. `--without NAME` of `CAUSES` switches a true error off, `--keep FOLDER` keeps the files,
-`--heads 2` measures half of the rows with a device that is 80 mm longer.
+with a polynomial or wave for each. Both correct X, Y, Z. Judged in the workpiece's frame and at the tool point that
+suit best: RMS, and largest. `--without NAME` of `CAUSES` switches a true error off, `--keep FOLDER` keeps the files,
+`--heads 2` measures half of the rows with a device that is 80 mm longer, `--ours NAME` runs these configs alone.
 """
 
 from __future__ import annotations
@@ -60,6 +61,8 @@ GEARS = "gears: {q2: 90, q3: 10 mm, q4: 10 mm, q5: 10 mm}\n"
 SHEET = FILE.replace("-200 mm, 200 mm", "-300 mm, 300 mm").replace("-250 mm, 250 mm", "-300 mm, 300 mm") + GEARS
 TIGHT = NUMBERS.replace("0.2 mm", "0.03 mm").replace(" 100 um", " 30 um").replace("200 um", "60 um")
 OURS = {"ours": FILE + NUMBERS, "ours, gears": FILE + GEARS + NUMBERS, "ours, sheet": SHEET + TIGHT}
+OURS |= {"ours, no bed": SHEET + TIGHT, "ours, named": SHEET + TIGHT}
+NAMED = "effects: [backlash, transmission, thermal, error_motion, gravity]\n"
 
 
 def turn(*parts: Array | float) -> Array:
@@ -128,7 +131,8 @@ class Machine:
         for k in range(3):
             errors = self.slide(k, q[:, k])
             turned = 2 * np.pi * q[:, [k]] / LEAD * [1, 2] + self.screw_at[k]
-            along = q[:, k] * (1 + self.leads[k]) + np.sin(turned) @ self.screw[k] + self.play[k + 2] / 2 * signs[:, k + 2]
+            along = q[:, k] * (1 + self.leads[k]) + np.sin(turned) @ self.screw[k]
+            along = along + self.play[k + 2] / 2 * signs[:, k + 2]
             errors[:, k] += along + self.screws[k] * warm[:, k + 2] * (q[:, k] - FIXED[k])
             shifts.append(errors[:, :3])
             turns.append(turn(*errors[:, 3:].T))
@@ -171,7 +175,7 @@ def drawn_table(joints: Array) -> Array:
 
 
 def day(rows: int, rng: np.random.Generator, ends: Array | None = None) -> tuple[Array, Array, Array, Array]:
-    """Joints, places on the plate, which sphere and what is told; `ends` of temperatures: of new targets, in no order."""
+    """Joints, places on the plate, which sphere, what is told; `ends` of temperatures: of new targets, in no order."""
     angles = np.stack([rng.uniform(-np.pi, np.pi, rows), rng.uniform(*SWIVEL, rows)], -1)
     which = rng.permutation(np.arange(rows) % len(SPHERES))
     scatter = rng.normal(0, [0.1, 0.5, 0.3, 0.3, 0.3], (rows, 5))
@@ -279,18 +283,20 @@ def by_process(joints: Array, told: Array, left: Array, wanted: Array, then: Arr
     return np.stack([make(kernel, normalize_y=True, random_state=0).fit(rows, one).predict(new) for one in left.T], -1)
 
 
-def table(joints: Array, told: Array, seen: Array, head: Array | None) -> tuple[str, Array]:
+def table(joints: Array, told: Array, seen: Array, head: Array | None, bed: bool) -> tuple[str, Array]:
     """Header and rows of a file in degrees, mm and deg C; `seen` has no columns where nothing was measured."""
-    names = ["q1[deg]", "q2[deg]", "q3[mm]", "q4[mm]", "q5[mm]", "temperature[degC]"]
+    names = ["q1[deg]", "q2[deg]", "q3[mm]", "q4[mm]", "q5[mm]"] + ["temperature[degC]"] * bed
     names += [f"temperature_{part}[degC]" for part in ("spindle", "x", "y", "z")]
     names += [f"direction{k}[1]" for k in range(1, 6)] + ["x[mm]", "y[mm]", "z[mm]"][: seen.shape[1]]
-    parts = [np.degrees(joints[:, :2]), 1e3 * joints[:, 2:], told, 1e3 * seen]
+    parts = [np.degrees(joints[:, :2]), 1e3 * joints[:, 2:], told[:, not bed :], 1e3 * seen]
     if head is not None:
         names, parts = [*names, "head[1]"], [*parts, head[:, None]]
     return ",".join(names), np.hstack(parts)
 
 
-def judged(seed: int, rows: int, without: tuple[str, ...], kept: Path | None, heads: int) -> dict[str, float]:
+def judged(
+    seed: int, rows: int, without: tuple[str, ...], kept: Path | None, heads: int, ours: list[str]
+) -> dict[str, float]:
     """RMS and largest of what one machine misses [m], by who calibrated it; NaN where there were no commands."""
     machine, rng = Machine(seed, without), np.random.default_rng([seed, 1])
     joints, _, which, told = day(rows, rng)
@@ -306,19 +312,22 @@ def judged(seed: int, rows: int, without: tuple[str, ...], kept: Path | None, he
         more = by_process(joints, told, left, wanted, then)
         more = times(drawn_table(wanted).swapaxes(1, 2), more)
         sent[f"{who} and process"] = corrected(goal - more, wanted, then, numbers)
-    for who, text in OURS.items():
-        text = text if heads == 1 else text.replace("tool_frame: unknown\n", "tool_frame: unknown\ntool_per: [head]\n")
-        records = table(joints, told, seen, head if heads > 1 else None)
-        targets = table(wanted, then, np.empty((NEW, 0)), None)
+    for who in ours:
+        told_per = "tool_frame: unknown\n" + "tool_per: [head]\n" * (heads > 1)
+        text = OURS[who].replace("tool_frame: unknown\n", told_per)
+        bed = who != "ours, no bed"
+        records = table(joints, told, seen, head if heads > 1 else None, bed)
+        targets = table(wanted, then, np.empty((NEW, 0)), None, bed)
+        config = CONFIG + NAMED * (who == "ours, named")
         with TemporaryDirectory() as folder:
             place = Path(folder) if kept is None else kept / who.replace(", ", "_")
             place.mkdir(parents=True, exist_ok=True)
-            commands = commanded(place, text, records, targets, "run", CONFIG)
+            commands = commanded(place, text, records, targets, "run", config)
         sent[who] = np.full_like(wanted, np.nan) if commands is None else commands
     found: dict[str, float] = {}
     for who, q in sent.items():
-        bad = bool(np.isnan(q).any())
-        found[who], found[f"{who}, largest"] = (np.nan,) * 2 if bad else missed(goal, wanted, machine.reached(q, then)[0])
+        off = (np.nan, np.nan) if np.isnan(q).any() else missed(goal, wanted, machine.reached(q, then)[0])
+        found[who], found[f"{who}, largest"] = off
     return found | {"a reading": NOISE * 3**0.5}
 
 
@@ -327,6 +336,7 @@ if __name__ == "__main__":
     options.add_argument("--without", nargs="*", choices=CAUSES, default=[])
     options.add_argument("--keep", type=Path)
     options.add_argument("--heads", type=int, choices=(1, 2), default=1)
+    options.add_argument("--ours", nargs="*", choices=OURS, default=list(OURS))
     asked, sys.argv[1:] = options.parse_known_args()
-    given = tuple(asked.without), asked.keep, asked.heads
+    given = tuple(asked.without), asked.keep, asked.heads, asked.ours
     judge_machines(__doc__, lambda seed, rows: judged(seed, rows, *given), 150)
