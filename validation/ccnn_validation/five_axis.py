@@ -184,7 +184,7 @@ def day(rows: int, rng: np.random.Generator, ends: Array | None = None) -> tuple
         rise = np.array([0.8, 14, 5, 6, 4]) * rng.uniform(0.7, 1.3, 5)
         speed = np.array([0.4, 1.5, 0.8, 0.8, 0.8])
         temperature = 20.5 + rise * (1 - np.exp(-time * speed)) + scatter
-        temperature[:, 1] -= 5 * (np.sin(4 * time[:, 0]) > 0.5)  # the spindle rests between
+        temperature[:, 1] -= 5 * (np.sin(4 * time[:, 0]) > 0.5)  # its chiller wins between
     else:
         at = rng.dirichlet(np.full(4, 0.7), rows) @ SPHERES
         temperature = ends[0] + (ends[1] - ends[0]) * np.clip(rng.uniform(0, 1, (rows, 1)) + scatter / 5, 0, 1)
@@ -320,7 +320,7 @@ def judged(
         targets = table(wanted, then, np.empty((NEW, 0)), None, bed)
         config = CONFIG + NAMED * (who == "ours, named")
         with TemporaryDirectory() as folder:
-            place = Path(folder) if kept is None else kept / who.replace(", ", "_")
+            place = Path(folder) if kept is None else kept / who.replace(", ", "_").replace(" ", "_")
             place.mkdir(parents=True, exist_ok=True)
             commands = commanded(place, text, records, targets, "run", config)
         sent[who] = np.full_like(wanted, np.nan) if commands is None else commands
