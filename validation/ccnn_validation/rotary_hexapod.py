@@ -1,15 +1,16 @@
-"""A motion platform on six rotary cranks with rods (6-RSS), which the package does not ship, under a changing payload.
+"""A motion platform on six rotary cranks with rods (6-RSS), which the package does not ship, under changing payload.
 
-`python -m ccnn_validation.rotary_hexapod --seed N [--machines N] [--rows N]`. A camera reads place and orientation of a
-probe on the platform, 20 µm and 50 µrad of noise in each; beside them stand the payload, thermometers on base plate and
-rods, and each crank's direction of approach. The true machine: joints, axes and lengths elsewhere, zeros, gears (50:1)
-that lose motion, have play, rub under load and run unevenly (once and twice a turn of output and motor), gears and rods
-that give under the payload, a base plate and rods that grow, and ball joints with clearance. Ours (`ccnn run`, by the
-written file) has the user's own class `rotary_cranks.RotaryHexapod` in `framed`: "ours" without more, "told" with the
-drawing's tolerances, "gears" also with the gears' ratio, "loads" also with the payload's moments in the place of its
-weight. "plain script" has the geometry, zeros and steel's growth; "fuller script" also the rest. "process" adds
-scikit-learn's on what is left. Told: RMS / largest miss of place [µm] and turn [µrad] on new targets in the best frame
-with the best tool. `--without NAME` of `CAUSES` switches a true error off, `--keep FOLDER` keeps the files.
+`python -m ccnn_validation.rotary_hexapod --seed N [--machines N] [--rows N]`. A camera reads place and orientation of
+a probe on the platform, 20 µm and 50 µrad of noise in each; beside them stand the payload, thermometers on base plate
+and rods, and each crank's direction of approach. The true machine: joints, axes and lengths elsewhere, zeros, gears of
+50:1 that lose motion, have play, rub under load and run unevenly (once and twice a turn of output and motor), gears and
+rods that give under own weight and payload, a base plate and rods that grow, and ball joints with clearance. Ours
+(`ccnn run`, by the written file) has the user's own class `rotary_cranks.RotaryHexapod` in `framed`: "ours" without
+more, "told" with the drawing's tolerances, "gears" also with the gears' ratio, "loads" also with the payload's force
+and moments in the place of its weight. "plain script" has the geometry, zeros and steel's growth; "fuller script" also
+the rest. "process" adds scikit-learn's on what is left. Told: RMS / largest miss of place [µm] and turn [µrad] on new
+targets in the best frame with the best tool. `--without NAME` of `CAUSES` switches a true error off, `--keep FOLDER`
+keeps the files.
 """
 
 from __future__ import annotations
@@ -33,19 +34,21 @@ Array = NDArray[np.float64]
 # By the drawing: radii of the joints, crank, rod [m], turns of the motor for one of the crank, mass of platform [kg].
 BASE, PLATFORM, CRANK, ROD, RATIO, MASS, G = 0.40, 0.30, 0.12, 0.45, 50.0, 30.0, 9.81
 PAIR, SIDE = np.radians(120.0 * (np.arange(6) // 2)), np.tile([-1.0, 1.0], 3)
-RING = np.stack([[np.cos(PAIR + SIDE * np.radians(a)), np.sin(PAIR + SIDE * np.radians(a)), 0 * PAIR] for a in (25, 48)])
-FEET, HEADS = BASE * RING[0].T, PLATFORM * RING[1].T
+RING = [PAIR + SIDE * np.radians(angle) for angle in (25, 48)]
+FEET = BASE * np.stack([np.cos(RING[0]), np.sin(RING[0]), 0 * PAIR], -1)
+HEADS = PLATFORM * np.stack([np.cos(RING[1]), np.sin(RING[1]), 0 * PAIR], -1)
 LEVEL, UP = np.stack([SIDE * np.sin(PAIR), -SIDE * np.cos(PAIR), 0 * PAIR], -1), np.tile([0.0, 0.0, 1.0], (6, 1))
 AXES = np.cross(LEVEL, UP)
 PROBE, HOME, STEEL, ALU = np.array([0.10, 0.05, 0.06]), 0.39, 11.5e-6, 23e-6
 NOISE, TURN_NOISE, NEW = 20e-6, 50e-6, 300
 WEIGHTS = 1 / np.repeat([NOISE, TURN_NOISE], 3)
-CAUSES = ("places axes lengths zeros lost play friction output motor gear stiffening stretch load warmth clearance").split()
+CAUSES = ("places axes lengths zeros lost play friction output motor gear "
+          "stiffening stretch load warmth clearance").split()  # fmt: skip
 INNER = "{mechanism: rotary_cranks.py:RotaryHexapod, base: true, tool: true, allow_code: true"
 CONFIG = f"mechanism: framed\nmechanism_keys: {INNER}}}\n"
 TOLD = CONFIG.replace("allow_code: true", "allow_code: true, keys: {told: true}")
 GEARS = CONFIG.replace("allow_code: true", "allow_code: true, keys: {told: true, gears: [50, 50, 50, 50, 50, 50]}")
-OURS = {"ours": (CONFIG, False), "ours, told": (TOLD, False), "ours, gears": (GEARS, False), "ours, loads": (GEARS, True)}
+OURS = {"ours": (CONFIG, 0), "ours, told": (TOLD, 0), "ours, gears": (GEARS, 0), "ours, loads": (GEARS, 1)}
 
 
 def turned(vector: Array) -> Array:
@@ -81,7 +84,8 @@ class Platform:
         def size(low: float, high: float, *shape: int) -> Array:
             return np.asarray(rng.uniform(low, high, shape) * rng.choice([-1, 1], shape))
 
-        self.feet, self.heads = FEET + on["places"] * size(2e-4, 1e-3, 6, 3), HEADS + on["places"] * size(1e-4, 5e-4, 6, 3)
+        self.feet = FEET + on["places"] * size(2e-4, 1e-3, 6, 3)
+        self.heads = HEADS + on["places"] * size(1e-4, 5e-4, 6, 3)
         lean = turned((LEVEL * size(1e-3, 4e-3, 6, 1) + UP * size(1e-3, 4e-3, 6, 1)) * on["axes"])
         self.level, self.up, self.axes = ((lean @ w[..., None])[..., 0] for w in (LEVEL, UP, AXES))
         self.crank, self.rod = CRANK + on["lengths"] * size(5e-5, 3e-4, 6), ROD + on["lengths"] * size(1e-4, 6e-4, 6)
@@ -92,8 +96,8 @@ class Platform:
         # Uneven gears: once and twice a turn of the crank and of the motor [rad].
         self.rate = np.array([1.0, 2.0, RATIO, 2 * RATIO])[:, None]
         kinds = [on["output"], on["output"], on["motor"], on["motor"]]
-        self.wave = np.stack([k * rng.uniform(*s, 6) for k, s in zip(kinds, ((5e-5, 2e-4), (2e-5, 1e-4), (2e-5, 6e-5),
-                              (4e-5, 1.2e-4)), strict=True)])  # fmt: skip
+        sizes = ((5e-5, 2e-4), (2e-5, 1e-4), (2e-5, 6e-5), (4e-5, 1.2e-4))
+        self.wave = np.stack([k * rng.uniform(*s, 6) for k, s in zip(kinds, sizes, strict=True)])
         self.phase = rng.uniform(0, 2 * np.pi, (4, 6))
         # What gears give below and above a torque [N m / rad, N m]; rods with their ball joints [N / m].
         self.soft, self.stiffer, self.knee = rng.uniform(3.5e4, 5e4, 6), rng.uniform(1.25, 1.5, 6), 15.0
@@ -127,7 +131,7 @@ class Platform:
         """Place and frame of the probe; `told`: temperatures of base and rods, payload [kg], directions, `s x 9`."""
         base, warm, payload, side = told[:, 0] - 20, told[:, 1] - 20, told[:, 2], told[:, 3:]
         waves = self.wave * np.sin(self.rate * joints[:, None] + self.phase)
-        angles = joints + self.zeros + waves.sum(1) + side * self.lost / 2
+        angles = joints + self.zeros + waves.sum(1) - side * self.lost / 2
         feet = self.feet + self.growth[0] * base[:, None, None] * (self.feet - self.bolt)
         heads = self.heads * (1 + self.growth[3] * (0.7 * warm)[:, None, None])
         rods = self.rod * (1 + np.outer(warm, [self.growth[1]])) + scatter
@@ -148,14 +152,15 @@ class Platform:
             size = np.abs(torque)
             over = np.clip(size - self.knee, 0, None)
             bent = np.sign(torque) * (size - over + over / self.stiffer) / self.soft * self.gives
-            wound = bent + side * self.friction * size / self.soft + self.play / 2 * np.tanh(torque / 3)
+            wound = bent - side * self.friction * size / self.soft + self.play / 2 * np.tanh(torque / 3)
             stretched = pull * self.rod_gives + self.clearance * np.tanh(pull / 15)
         return at + frame @ self.point, frame @ self.probe
 
     def measured(self, joints: Array, told: Array, rng: np.random.Generator) -> tuple[Array, Array]:
         """As the camera reads it: place `s x 3` [m], frame; cranks and ball joints rest with some scatter."""
         really = told + np.pad(rng.normal(0, 0.1, (len(told), 2)), ((0, 0), (0, 7)))
-        place, frame = self.reached(joints + rng.normal(0, 8e-6, joints.shape), really, rng.normal(0, 1.5e-6, joints.shape))
+        scatter = rng.normal(0, 8e-6, joints.shape), rng.normal(0, 1.5e-6, joints.shape)
+        place, frame = self.reached(joints + scatter[0], really, scatter[1])
         place = place @ self.turn.T + self.stand + rng.normal(0, NOISE, place.shape)
         return place, turned(rng.normal(0, TURN_NOISE, place.shape)) @ self.turn @ frame
 
@@ -305,7 +310,8 @@ def judged(seed: int, rows: int, without: tuple[str, ...], names: list[str], kep
         loads.append(-G * some[:, [2]] * np.c_[np.ones(len(some)), lever[:, 1], -lever[:, 0]])
     for who in names:
         config, moments = OURS[who]
-        tables = table(joints, told, loads[0] if moments else None, seen), table(wanted, then, loads[1] if moments else None, None)
+        first, second = loads if moments else (None, None)
+        tables = table(joints, told, first, seen), table(wanted, then, second, None)
         with TemporaryDirectory() as folder:
             place = Path(folder) if kept is None else kept / f"{seed}" / who.replace(", ", "_").replace(" ", "_")
             place.mkdir(parents=True, exist_ok=True)
@@ -313,11 +319,9 @@ def judged(seed: int, rows: int, without: tuple[str, ...], names: list[str], kep
             commands = commanded(place, text, *tables, "run", config, "rotary_cranks.py", "--allow-code")
             print(f"  {who}: {clock.time() - begin:.0f} s", file=sys.stderr)
         sent[who] = np.full_like(wanted, np.nan) if commands is None else commands
-    found = {}
-    for who, q in sent.items():
-        gone = bool(np.isnan(q).any())
-        found[who] = np.full(4, np.nan) if gone else missed(*goal, *machine.reached(q, then))
-    return found | {"a reading": np.array([NOISE * 3**0.5, np.nan, TURN_NOISE * 3**0.5, np.nan])}
+    found = {who: missed(*goal, *machine.reached(q, then)) for who, q in sent.items() if not np.isnan(q).any()}
+    found["a reading"] = np.array([NOISE, np.nan, TURN_NOISE, np.nan]) * 3**0.5
+    return dict.fromkeys(sent, np.full(4, np.nan)) | found
 
 
 def main() -> None:
@@ -330,8 +334,7 @@ def main() -> None:
     options.add_argument("--ours", default=";".join(OURS), help="contestants, between semicolons")
     options.add_argument("--keep", type=Path)
     given = options.parse_args()
-    names = [name for name in given.ours.split(";") if name]
-    every = []
+    names, every = [name for name in given.ours.split(";") if name], []
     for seed in range(given.seed, given.seed + given.machines):
         every.append(judged(seed, given.rows, tuple(given.without), names, given.keep))
         print(f"{seed} [µm, µrad]:", *(f"  {who} {told_as(value)}" for who, value in every[-1].items()), sep="\n")
