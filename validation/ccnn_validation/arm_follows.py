@@ -3,18 +3,18 @@
 `python -W ignore -m ccnn_validation.arm_follows --seed N [--machines K] [--without CAUSE] [--keep FOLDER]
 [--ours NAMES]`. Base, shoulder and elbow; links of 6 and 5.5 kg, 2 kg at the tool; gears of 100:1. Each joint is driven
 by PD at 1 kHz on the motor's encoder, with parts of speed and weight fed forward, some ms after the command; set points
-and the encoders behind the gears are logged at 250 Hz. True causes, drawn for each arm, the values of each joint apart:
-masses, centres and inertias; another load at the tool; friction (bristles, at rest, by load, by direction, degressive,
-warmer later); gains; feedforward; delay; softer gears, softest near no torque; ripple of torque and transmission. What
-is not drawn is as the data sheet has it. Logged: two sums of sines and one of moves, 10 s each. Judged: three new motions
-that are sent once: pick and place by S-curves, two turns of a circle, a line at 30 mm/s.
+and the encoders behind the gears are logged at 250 Hz. True causes, drawn for each arm, values for each joint: masses,
+centres and inertias; another load; friction (bristles, at rest, by load, direction, degressive, warmer later); gains;
+feedforward; delay; softer gears, softest near no torque; ripple of torque and transmission. What is not drawn is as the
+data sheet has it. Logged: two sums of sines and one run of moves, 10 s each. Judged: three new motions that are sent
+once: pick and place by S-curves, two turns of a circle, a line at 30 mm/s.
 
-All know the data sheet. "shifted" sends the commands earlier by the mean lag. "regression" is what the command is beyond
-the measured motion, linear in weights, inverse dynamics, friction and lag. "plain script" fits a simulated rigid arm with
-give of the gears by least squares, and iterates its error away. Ours: `ccnn diagnose --motion`, then `ccnn compensate`,
-with the servo without keys ("bare") and with those of the data sheet and how well they are known ("keys"), with the arm as
-MJCF ("mjcf"), and with the simulator of the plain script ("simulator"). Told: of each motion RMS / peak of the joints
-[mrad] and of the tool [mm].
+All know the data sheet. "shifted" sends commands earlier by the mean lag. "regression" is what the command is beyond
+the measured motion, linear in weights, inverse dynamics, friction and lag. "plain script" fits a simulated rigid arm
+with give of the gears by least squares, and iterates its error away. Ours: `ccnn diagnose --motion`, then `ccnn compensate`,
+with the servo without keys ("bare") and with those of the data sheet and how well they are known ("keys"), with the arm
+as MJCF ("mjcf"), and with the simulator of the plain script ("simulator", arm_simulator.py). Told: RMS / peak of the
+joints [mrad] and of the tool [mm] in each motion.
 """
 
 from __future__ import annotations
@@ -32,22 +32,38 @@ from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.optimize import least_squares
 
 from ccnn_validation import arm_simulator
+from ccnn_validation.arm_sheet import (
+    BALANCE,
+    BASE,
+    C2,
+    C3,
+    DELAY,
+    DRY,
+    FORWARD,
+    I2,
+    I3,
+    KD,
+    KP,
+    L2,
+    L3,
+    LOAD,
+    M2,
+    M3,
+    MOTOR,
+    PLACE,
+    REACH,
+    STIFF,
+    WET,
+    G,
+    keys,
+    mjcf,
+)  # fmt: skip
 from ccnn_validation.arm_simulator import NAMES, SIZES, START, driven
 from ccnn_validation.delivered.product import Contestant
 
 Array = NDArray[np.float64]
 # Steps of the log, the controller and the truth [s]; samples of a run; of those judged, what is left out at both ends.
 STEP, CONTROL, FINE, SAMPLES, EDGE = 4e-3, 1e-3, 2.5e-4, 2501, 75
-G = 9.81
-# By the data sheet. Links: lengths [m], masses [kg], centres [m], inertias about those [kg m²]; base; load [kg].
-L2, L3, M2, M3, C2, C3, I2, I3, BASE, LOAD = 0.40, 0.42, 6.0, 5.5, 0.18, 0.15, 0.09, 0.08, 0.15, 2.0
-# Drives, at the joints: gain [N m/rad, N m s/rad], shares of speed and weight that are fed forward, delay [s], inertia
-# [kg m²], dry friction, more of it at rest [N m], viscous [N m s/rad], stiffness of the gears [N m/rad].
-KP, KD, FORWARD, BALANCE, DELAY = np.array([6000.0, 6000, 2200]), np.array([220.0, 220, 70]), 0.8, 0.8, 4e-3
-MOTOR, DRY, REST, WET = np.array([0.6, 0.6, 0.25]), np.array([8.0, 8, 4]), np.array([1.5, 1.5, 0.8]), np.array([12.0, 12, 5])
-STIFF = np.array([25e3, 25e3, 10e3])
-# Joints are measured around this place, as far as that [rad].
-PLACE, REACH = np.array([0.0, 0.78, -1.3]), np.array([0.9, 0.5, 0.55])
 # Of an encoder: standard deviation and step of a reading [rad].
 NOISE, COUNT = 5e-6, 2 * np.pi / 2**19
 CAUSES = ("masses", "load", "friction", "gains", "forward", "delay", "soft", "ripple")
@@ -73,8 +89,8 @@ class Arm:
         self.links = np.stack(
             [mass, mass * along, mass * across, mass * along**2 + about, mass * across**2 + slim, mass * along * across]
         )
-        load, far, side = LOAD * either("load", 0.7, 1.35, 1, 1)[0], L3 + either("load", -0.03, 0.05, 0, 1)[0], either(
-            "load", -0.04, 0.04, 0, 1)[0]
+        load, far = LOAD * either("load", 0.7, 1.35, 1, 1)[0], L3 + either("load", -0.03, 0.05, 0, 1)[0]
+        side = either("load", -0.04, 0.04, 0, 1)[0]
         self.links[:, 1] += load * np.array([1, far, side, far**2, side**2, far * side])
         self.base, self.motor = BASE * either("masses", 0.7, 1.4, 1, 1)[0], MOTOR * either("masses", 0.85, 1.15, 1)
         self.dry, self.wet = DRY * either("friction", 0.6, 1.8, 1), WET * either("friction", 0.6, 2.2, 1)
@@ -92,31 +108,18 @@ class Arm:
     def dynamics(self, q: Array, w: Array) -> tuple[Array, Array, Array]:
         """Inertias `n x 4` (yaw, and 22, 23, 33), and torques `n x 3` of speed and of weight, of the links."""
         (c2, s2), (c3, s3) = ((np.cos(a), np.sin(a)) for a in (q[:, 1], q[:, 1] + q[:, 2]))
-        (m2, x2, y2, xx2, yy2, xy2), (m3, x3, y3, xx3, yy3, xy3) = self.links.T
+        (_m2, x2, y2, xx2, yy2, xy2), (m3, x3, y3, xx3, yy3, xy3) = self.links.T
         er, ez, ur, uz, wr = L2 * c2, L2 * s2, x3 * c3 - y3 * s3, x3 * s3 + y3 * c3, x2 * c2 - y2 * s2
         wrr, wrz = xx2 * c2**2 + yy2 * s2**2 - 2 * xy2 * c2 * s2, (xx2 - yy2) * c2 * s2 + xy2 * (c2**2 - s2**2)
         urr, urz = xx3 * c3**2 + yy3 * s3**2 - 2 * xy3 * c3 * s3, (xx3 - yy3) * c3 * s3 + xy3 * (c3**2 - s3**2)
         dot, cross, whole = er * ur + ez * uz, er * uz - ez * ur, xx3 + yy3
-        inertia = np.stack(
-            [
-                self.base + wrr + m3 * er**2 + 2 * er * ur + urr,
-                xx2 + yy2 + m3 * L2**2 + 2 * dot + whole,
-                dot + whole,
-                np.full(len(q), whole),
-            ],
-            -1,
-        )
-        turn2 = -2 * (wrz + m3 * er * ez + er * uz + ez * ur + urz)
-        turn3 = -2 * (er * uz + urz)
+        yaw = self.base + wrr + m3 * er**2 + 2 * er * ur + urr
+        lift = xx2 + yy2 + m3 * L2**2 + 2 * dot + whole
+        inertia = np.stack([yaw, lift, dot + whole, np.full(len(q), whole)], -1)
+        turn2, turn3 = -2 * (wrz + m3 * er * ez + er * uz + ez * ur + urz), -2 * (er * uz + urz)
         w1, w2, w3 = w.T
-        fast = np.stack(
-            [
-                (turn2 * w2 + turn3 * w3) * w1,
-                (w2**2 - (w2 + w3) ** 2) * cross - 0.5 * w1**2 * turn2,
-                w2**2 * cross - 0.5 * w1**2 * turn3,
-            ],
-            -1,
-        )
+        fast2 = (w2**2 - (w2 + w3) ** 2) * cross - 0.5 * w1**2 * turn2
+        fast = np.stack([(turn2 * w2 + turn3 * w3) * w1, fast2, w2**2 * cross - 0.5 * w1**2 * turn3], -1)
         return inertia, fast, G * np.stack([0 * ur, wr + m3 * er + ur, ur], -1)
 
     def went(self, runs: list[Array], warm: bool = False) -> list[Array]:
@@ -152,17 +155,10 @@ class Arm:
             brake = bristle * z + friction * self.wet * vm / (1 + self.bend * np.abs(vm))
             vm = vm + FINE / self.motor * (torque + self.ripple * np.sin(angle + self.phase[1]) - brake - gear)
             m, fast, weight = self.dynamics(q, v)
-            push = gear - fast - weight
-            below = m[:, 1] * m[:, 3] - m[:, 2] ** 2
-            rate = np.stack(
-                [
-                    push[:, 0] / m[:, 0],
-                    (m[:, 3] * push[:, 1] - m[:, 2] * push[:, 2]) / below,
-                    (m[:, 1] * push[:, 2] - m[:, 2] * push[:, 1]) / below,
-                ],
-                -1,
-            )
-            v = v + FINE * rate
+            p1, p2, p3 = (gear - fast - weight).T
+            m11, m22, m23, m33 = m.T
+            below = m22 * m33 - m23**2
+            v = v + FINE * np.stack([p1 / m11, (m33 * p2 - m23 * p3) / below, (m22 * p3 - m23 * p2) / below], -1)
             qm, q = qm + FINE * vm, q + FINE * v
         return list(found)
 
@@ -184,7 +180,7 @@ def joints(at: Array) -> Array:
 
 def moves(places: Array, speeds: Array, rest: float) -> Array:
     """Ways between places [rad] at speeds [rad/s] of the fastest joint, S-curves, `SAMPLES`."""
-    t = np.cumsum(np.r_[0.3, *([np.abs(b - a).max() / s, rest] for a, b, s in zip(places[:-1], places[1:], speeds))])
+    t = np.cumsum(np.r_[0.3, *([np.abs(b - a).max() / s, rest] for a, b, s in zip(places[:-1], places[1:], speeds, strict=False))])
     at = np.repeat(places, 2, 0)[: len(t) + 1]
     course = np.stack([np.interp(np.arange(SAMPLES) * STEP, np.r_[0, t], at[:, k]) for k in range(3)], -1)
     for width in (50, 25, 10):
@@ -252,7 +248,7 @@ def earlier(course: Array, lag: Array) -> Array:
 def mean_lag(runs: list[Array], seen: list[Array]) -> Array:
     """By what each joint is late [s]."""
     speed = np.concatenate([smooth(run, 1) for run in runs])
-    return np.asarray((speed * np.concatenate([c - q for q, c in zip(seen, runs)])).sum(0) / (speed**2).sum(0))
+    return np.asarray((speed * np.concatenate([c - q for q, c in zip(seen, runs, strict=False)])).sum(0) / (speed**2).sum(0))
 
 
 def shifted(runs: list[Array], seen: list[Array], new: list[Array]) -> list[Array]:
@@ -282,12 +278,12 @@ def plain_script(runs: list[Array], seen: list[Array], new: list[Array]) -> list
     """Fit the simulated arm to the runs, and move the commands of new ones by the error that it predicts."""
 
     def residuals(u: Array) -> Array:
-        off = [driven(c, STEP, START + SIZES * u) - q for c, q in zip(runs, seen)]
+        off = [driven(c, STEP, START + SIZES * u) - q for c, q in zip(runs, seen, strict=False)]
         return np.r_[np.concatenate(off)[::2].ravel() / 3e-4, u]
 
     found = least_squares(residuals, np.zeros(len(START)), x_scale=1.0, diff_step=1e-4, max_nfev=15)
     numbers = START + SIZES * found.x
-    print("  " + " ".join(f"{n} {v:.4g}" for n, v in zip(NAMES, numbers)), file=sys.stderr)
+    print("  " + " ".join(f"{n} {v:.4g}" for n, v in zip(NAMES, numbers, strict=False)), file=sys.stderr)
     lag, corrected = mean_lag(runs, seen), []
     for goal in new:
         course, best = goal.copy(), (np.inf, goal)
@@ -299,48 +295,11 @@ def plain_script(runs: list[Array], seen: list[Array], new: list[Array]) -> list
     return corrected
 
 
-def keys() -> list[str]:
-    """The data sheet as keys of the servo, the other joints where they are in the middle; and how well they are known."""
-    c3, out2, out3 = np.cos(PLACE[2]), M2 * C2 + (M3 + LOAD) * L2, M3 * C3 + LOAD * L3
-    whole3 = I3 + M3 * C3**2 + LOAD * L3**2
-    whole2 = I2 + M2 * C2**2 + (M3 + LOAD) * L2**2 + 2 * L2 * out3 * c3 + whole3
-    low, high = np.cos(PLACE[1]), np.cos(PLACE[1] + PLACE[2])
-    whole1 = BASE + (I2 + M2 * C2**2 + (M3 + LOAD) * L2**2) * low**2 + 2 * L2 * out3 * low * high + whole3 * high**2
-    links, rest = np.array([whole1, whole2, whole3]), G * (1 - BALANCE)
-    values = {
-        "gain": KP, "derivative": FORWARD * KD / KP, "inertia": links + MOTOR, "load_inertia": links,
-        "viscous": WET + KD * (1 - FORWARD), "coulomb": DRY, "stribeck": REST, "stribeck_speed": np.full(3, 0.05),
-        "gravity_cos": rest * np.array([0, out2 + out3 * c3, out3 * np.cos(PLACE[1])]),
-        "gravity_sin": rest * np.array([0, -out3 * np.sin(PLACE[2]), out3 * np.sin(PLACE[1])]),
-        "flexibility": links / STIFF, "flexible_damping": np.full(3, 0.05), "delay": np.full(3, DELAY),
-    }  # fmt: skip
-    told = ", ".join(f"{name}: [{', '.join(f'{x:.5g}' for x in value)}]" for name, value in values.items())
-    known = "gain: 10 %, derivative: 20 %, inertia: 25 %, viscous: 40 %, coulomb: 40 %, stribeck: 50 %, delay: 50 %"
-    return [f"mechanism_keys={{{told}}}", f"known={{{known}}}"]
-
-
-def mjcf() -> str:
-    """The data sheet as MJCF; speed that is fed forward lessens the drive's own damping, weight that is, the weight."""
-    drive = [f'armature="{m}" damping="{w}" frictionloss="{d}"' for m, w, d in zip(MOTOR, WET, DRY)]
-    slim = [f'gravcomp="{BALANCE}"><inertial mass="{m}" pos="{c} 0 0" diaginertia="{m * 0.0016} {i} {i}"/'
-            for m, c, i in ((M2, C2, I2), (M3, C3, I3))]  # fmt: skip
-    motors = "".join(
-        f'<position joint="j{k + 1}" kp="{KP[k]}" kv="{KD[k] * (1 - FORWARD):g}"/>' for k in range(3)
-    )
-    return f"""<mujoco><compiler angle="radian"/><option timestep="0.001" integrator="implicitfast"/><worldbody>
-<body><inertial mass="4" pos="0 0 0" diaginertia="{BASE} {BASE} {BASE}"/><joint name="j1" axis="0 0 1" {drive[0]}/>
-<body {slim[0]}><joint name="j2" axis="0 -1 0" {drive[1]}/>
-<body pos="{L2} 0 0" {slim[1]}><joint name="j3" axis="0 -1 0" {drive[2]}/>
-<body pos="{L3} 0 0" gravcomp="{BALANCE}"><inertial mass="{LOAD}" pos="0 0 0" diaginertia="1e-4 1e-4 1e-4"/>
-<site name="tool"/></body></body></body></body></worldbody><actuator>{motors}</actuator></mujoco>
-"""
-
-
 def ours(folder: Path, name: str, runs: list[Array], seen: list[Array], new: list[Array]) -> list[Array] | None:
     """Commands of `ccnn diagnose --motion` and `ccnn compensate`; None where there are none."""
     folder.mkdir(parents=True, exist_ok=True)
     t, head = np.arange(SAMPLES) * STEP, ",".join(f"command{k}[rad]" for k in (1, 2, 3))
-    for i, (run, q) in enumerate(zip(runs, seen), 1):
+    for i, (run, q) in enumerate(zip(runs, seen, strict=False), 1):
         columns = f"time[s],{head},q1[rad],q2[rad],q3[rad]"
         np.savetxt(folder / f"run{i}.csv", np.c_[t, run, q], "%.9g", ",", header=columns, comments="")
     many = np.concatenate([np.c_[np.full(SAMPLES, i), t, run] for i, run in enumerate(new)])
@@ -348,8 +307,9 @@ def ours(folder: Path, name: str, runs: list[Array], seen: list[Array], new: lis
     (folder / "arm.py").write_text(Path(arm_simulator.__file__).read_text())
     (folder / "arm.xml").write_text(mjcf())
     contestant = Contestant(folder, "diagnose")
-    choices = {"bare": ["servo"], "keys": ["servo", *keys()], "mjcf": ["arm.xml"], "simulator": ["arm.py:ARM"]}
-    options = ["--mechanism", choices[name][0], "--out", "found", *choices[name][1:]]
+    (folder / "keys.yaml").write_text(keys())
+    choices = {"mjcf": ["arm.xml"], "simulator": ["arm.py:ARM"], "keys": ["servo", "--config", "keys.yaml"]}
+    options = ["--out", "found", "--mechanism", *choices.get(name, ["servo"])]
     start = clock.time()
     contestant.call("diagnose", *(word for i in (1, 2, 3) for word in ("--motion", f"run{i}.csv")), *options)
     between = clock.time()

@@ -21,7 +21,7 @@ def driven(c, step, p):
     k2, k3 = np.sqrt(0.09 / 6.0), np.sqrt(0.08 / 5.5)
     weights = np.array([m2 / 2, m2 / 2, m3 / 2, m3 / 2, load])
     along = np.array([c2 - k2, c2 + k2, c3 - k3, c3 + k3, 0.42])
-    parts = max(int(round(step / 1e-3)), 1)
+    parts = max(round(step / 1e-3), 1)
     h, lead = step / parts, 500
     found, q, v = np.empty_like(c), c[0].copy(), np.zeros(3)
     before, fed = c[0].copy(), np.zeros(3)
@@ -92,7 +92,7 @@ def driven(c, step, p):
 
 
 class ARM:
-    parameters = dict(zip(NAMES, START.tolist()))
+    parameters = dict(zip(NAMES, START.tolist(), strict=False))
 
     def simulate(self, time, commands, parameters):
         step = (time[-1] - time[0]) / (len(time) - 1)
