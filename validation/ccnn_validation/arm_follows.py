@@ -11,7 +11,7 @@ once: pick and place by S-curves, two turns of a circle, a line at 30 mm/s.
 
 All know the data sheet. "shifted" sends commands earlier by the mean lag. "regression" is what the command is beyond
 the measured motion, linear in weights, inverse dynamics, friction and lag. "plain script" fits a simulated rigid arm
-with give of the gears by least squares, and iterates its error away. Ours: `ccnn diagnose --motion`, then `ccnn compensate`,
+with give of the gears by least squares, and iterates its error away. Ours: `ccnn diagnose --motion` and `compensate`,
 with the servo without keys ("bare") and with those of the data sheet and how well they are known ("keys"), with the arm
 as MJCF ("mjcf"), and with the simulator of the plain script ("simulator", arm_simulator.py). Told: RMS / peak of the
 joints [mrad] and of the tool [mm] in each motion.
@@ -31,33 +31,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.optimize import least_squares
 
-from ccnn_validation import arm_simulator
-from ccnn_validation.arm_sheet import (
-    BALANCE,
-    BASE,
-    C2,
-    C3,
-    DELAY,
-    DRY,
-    FORWARD,
-    I2,
-    I3,
-    KD,
-    KP,
-    L2,
-    L3,
-    LOAD,
-    M2,
-    M3,
-    MOTOR,
-    PLACE,
-    REACH,
-    STIFF,
-    WET,
-    G,
-    keys,
-    mjcf,
-)  # fmt: skip
+from ccnn_validation import arm_simulator  # noqa: I001
+from ccnn_validation.arm_sheet import BALANCE, BASE, C2, C3, DELAY, DRY, FORWARD, G, I2, I3, KD, KP, L2, L3, LOAD, M2, M3
+from ccnn_validation.arm_sheet import MOTOR, PLACE, REACH, STIFF, WET, keys, mjcf
 from ccnn_validation.arm_simulator import NAMES, SIZES, START, driven
 from ccnn_validation.delivered.product import Contestant
 
@@ -180,7 +156,7 @@ def joints(at: Array) -> Array:
 
 def moves(places: Array, speeds: Array, rest: float) -> Array:
     """Ways between places [rad] at speeds [rad/s] of the fastest joint, S-curves, `SAMPLES`."""
-    t = np.cumsum(np.r_[0.3, *([np.abs(b - a).max() / s, rest] for a, b, s in zip(places[:-1], places[1:], speeds, strict=False))])
+    t = np.cumsum(np.r_[0.3, *([np.abs(b - a).max() / s, rest] for a, b, s in zip(places[:-1], places[1:], speeds))])
     at = np.repeat(places, 2, 0)[: len(t) + 1]
     course = np.stack([np.interp(np.arange(SAMPLES) * STEP, np.r_[0, t], at[:, k]) for k in range(3)], -1)
     for width in (50, 25, 10):
@@ -248,7 +224,7 @@ def earlier(course: Array, lag: Array) -> Array:
 def mean_lag(runs: list[Array], seen: list[Array]) -> Array:
     """By what each joint is late [s]."""
     speed = np.concatenate([smooth(run, 1) for run in runs])
-    return np.asarray((speed * np.concatenate([c - q for q, c in zip(seen, runs, strict=False)])).sum(0) / (speed**2).sum(0))
+    return np.asarray((speed * np.concatenate([c - q for q, c in zip(seen, runs)])).sum(0) / (speed**2).sum(0))
 
 
 def shifted(runs: list[Array], seen: list[Array], new: list[Array]) -> list[Array]:
@@ -278,12 +254,12 @@ def plain_script(runs: list[Array], seen: list[Array], new: list[Array]) -> list
     """Fit the simulated arm to the runs, and move the commands of new ones by the error that it predicts."""
 
     def residuals(u: Array) -> Array:
-        off = [driven(c, STEP, START + SIZES * u) - q for c, q in zip(runs, seen, strict=False)]
+        off = [driven(c, STEP, START + SIZES * u) - q for c, q in zip(runs, seen)]
         return np.r_[np.concatenate(off)[::2].ravel() / 3e-4, u]
 
     found = least_squares(residuals, np.zeros(len(START)), x_scale=1.0, diff_step=1e-4, max_nfev=15)
     numbers = START + SIZES * found.x
-    print("  " + " ".join(f"{n} {v:.4g}" for n, v in zip(NAMES, numbers, strict=False)), file=sys.stderr)
+    print("  " + " ".join(f"{n} {v:.4g}" for n, v in zip(NAMES, numbers)), file=sys.stderr)
     lag, corrected = mean_lag(runs, seen), []
     for goal in new:
         course, best = goal.copy(), (np.inf, goal)
@@ -299,7 +275,7 @@ def ours(folder: Path, name: str, runs: list[Array], seen: list[Array], new: lis
     """Commands of `ccnn diagnose --motion` and `ccnn compensate`; None where there are none."""
     folder.mkdir(parents=True, exist_ok=True)
     t, head = np.arange(SAMPLES) * STEP, ",".join(f"command{k}[rad]" for k in (1, 2, 3))
-    for i, (run, q) in enumerate(zip(runs, seen, strict=False), 1):
+    for i, (run, q) in enumerate(zip(runs, seen), 1):
         columns = f"time[s],{head},q1[rad],q2[rad],q3[rad]"
         np.savetxt(folder / f"run{i}.csv", np.c_[t, run, q], "%.9g", ",", header=columns, comments="")
     many = np.concatenate([np.c_[np.full(SAMPLES, i), t, run] for i, run in enumerate(new)])
