@@ -17,7 +17,7 @@ as MJCF ("mjcf"), and with the simulator of the plain script ("simulator", arm_s
 joints [mrad] and of the tool [mm] in each motion.
 """
 
-from __future__ import annotations
+from __future__ import annotations  # noqa: I001
 
 import argparse
 import json
@@ -31,9 +31,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.optimize import least_squares
 
-from ccnn_validation import arm_simulator  # noqa: I001
-from ccnn_validation.arm_sheet import BALANCE, BASE, C2, C3, DELAY, DRY, FORWARD, G, I2, I3, KD, KP, L2, L3, LOAD, M2, M3
-from ccnn_validation.arm_sheet import MOTOR, PLACE, REACH, STIFF, WET, keys, mjcf
+from ccnn_validation import arm_simulator
+from ccnn_validation.arm_sheet import BALANCE, BASE, C2, C3, DELAY, DRY, FORWARD, G, I2, I3, KD, KP, L2, L3, LOAD, M2
+from ccnn_validation.arm_sheet import M3, MOTOR, PLACE, REACH, STIFF, WET, keys, mjcf
 from ccnn_validation.arm_simulator import NAMES, SIZES, START, driven
 from ccnn_validation.delivered.product import Contestant
 
