@@ -165,8 +165,9 @@ def corrected_command(
     command, position, left = wanted, plain, _rms(error)
     divided = _division(nominal, axes, time, wanted, plain, around)
     for _ in range(_STEPS):
-        move = gaussian_filter1d(divided(error), _SMOOTH / step, axis=0)
-        trials = np.stack([np.clip(command + share * move, lowest, highest) for share in _SHARES])
+        # Where an axis sticks, or slips, a pulse tells nothing of it: the error itself is a step as well.
+        moves = [gaussian_filter1d(one, _SMOOTH / step, axis=0) for one in (divided(error), error)]
+        trials = np.stack([np.clip(command + share * move, lowest, highest) for move in moves for share in _SHARES])
         # Whoever waits at the first command stands where the motion begins.
         trials[:, 0] = np.clip(rest, lowest[0], highest[0])
         found = moved(nominal, axes, time, trials, around)

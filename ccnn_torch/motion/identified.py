@@ -17,6 +17,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.motion.effects.bodies import CARRIED
 from ccnn_torch.motion.effects.registry import OWN
 from ccnn_torch.motion.engine import MotionDiagnosis
+from ccnn_torch.motion.linearised import own_values
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.servo import TORQUES, axis_keys
 from ccnn_torch.motion.setting import nominal_of
@@ -82,8 +83,7 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     """
     library, data = found.problem.library, found.problem.data
     values = library.parameters(torch.stack([spec.theta for spec in found.followed]), found.problem.axes)
-    own = {name.removeprefix(OWN): values.pop(name) for name in [*values] if name.startswith(OWN)}
-    values.pop(CARRIED, None)
+    values = {name: v for name, v in values.items() if name != CARRIED and not name.startswith(OWN)}
     count = len(found.followed)
     axes = [{name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]} for i in range(count)]
     content = _File(
@@ -105,8 +105,8 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
         content.mechanism_keys = axis_keys(nominal, axes, _mass(found))
     elif nominal.simulator is not None:
         parameters = dict(nominal.simulator.parameters)
-        for name, v in own.items():
-            parameters[name] += float(v.sum() / (v != 0).sum().clamp_min(1))
+        for name, value in own_values(found.problem, found.followed).items():
+            parameters[name] += value
         content.mechanism_keys = parameters
     elif nominal.loaded is not None:
         from ccnn_torch.motion.mujoco_motion import write_mjcf

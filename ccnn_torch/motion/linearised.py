@@ -46,7 +46,7 @@ def searched(problem: Problem, logs: Sequence[Log], nominal: Nominal, without: C
     own = nominal.simulator.parameters if nominal.simulator is not None else {}
     about: Values = dict.fromkeys(own, 0.0)
     found = search(problem)
-    if not _own_values(problem, _best(found)):
+    if not own_values(problem, _best(found)):
         return found
     alone = _settled(problem, found.whitening, [_own_spec(problem)] * len(problem.axes), logs, nominal, about)
     if alone is not None:
@@ -55,7 +55,7 @@ def searched(problem: Problem, logs: Sequence[Log], nominal: Nominal, without: C
     for _ in range(_SEARCHES):
         settled = _settled(problem, found.whitening, _best(found), logs, nominal, about)
         # Nothing is wrong with them, or no part of what is said to be is true: that is judged where the model is.
-        if settled is None or (any(about.values()) and not _own_values(problem, _best(found))):
+        if settled is None or (any(about.values()) and not own_values(problem, _best(found))):
             return search(without())
         if _is_near(own, settled[1], about, _NEAR):
             return found
@@ -77,7 +77,7 @@ def _settled(
     own, begin = nominal.simulator.parameters, about
     for _ in range(_FITS):
         specs = [fit.spec for fit in fit_many(problem, whitening, list(enumerate(specs)))]
-        values = _own_values(problem, specs)
+        values = own_values(problem, specs)
         # A parameter that no set has goes back to its nominal value.
         wanted = {name: _plausible(value, values.get(name, 0.0)) for name, value in own.items()}
         if _is_near(own, wanted, about, _SETTLED):
@@ -124,15 +124,30 @@ def _left(problem: Problem, specs: Sequence[Spec], values: Values) -> float:
     for i, axis in enumerate(problem.library.numbers):
         for j, number in enumerate(axis):
             name = number.acts[0].parameter
-            if name.startswith(OWN) and theta[i, j] != 0:
-                theta[i, j] = values[name.removeprefix(OWN)] / number.scale
+            if name.startswith(OWN):
+                theta[i, j] = values.get(name.removeprefix(OWN), 0.0) / number.scale
     judged = problem.data.judged
     left: Tensor = problem.residual(theta, problem.axes)[:, judged].square().mean(-1)
     return float((left / problem.data.position[:, judged].var(-1).clamp_min(1e-300)).sum())
 
 
-def _own_values(problem: Problem, specs: Sequence[Spec]) -> dict[str, float]:
-    """What is added to a simulator's own parameters: the mean over the axes whose set has them."""
-    parameters = problem.library.parameters(torch.stack([spec.theta for spec in specs]), problem.axes)
-    values = {n: v[v != 0] for n, v in parameters.items() if n.startswith(OWN)}
-    return {name.removeprefix(OWN): float(v.mean()) for name, v in values.items() if len(v)}
+def own_values(problem: Problem, specs: Sequence[Spec]) -> dict[str, float]:
+    """What is added to those of a simulator's own parameters that some axis' set has: of each one value for all axes.
+
+    Least squares of what all axes leave beside the other effects of their sets, each weighed by what its own set leaves:
+    an axis that hardly shows a parameter has no say in it.
+    """
+    numbers, theta = problem.library.numbers[0], torch.stack([spec.theta for spec in specs])
+    acts = {j: n.acts[0].parameter for j, n in enumerate(numbers) if n.acts}
+    own = {j: name.removeprefix(OWN) for j, name in acts.items() if name.startswith(OWN)}
+    named = [j for j in own if bool((theta[:, j] != 0).any())]
+    if not named:
+        return {}
+    judged, sizes = problem.data.judged, theta.new_tensor([numbers[j].scale for j in named])
+    noise = problem.residual(theta, problem.axes)[:, judged].square().mean(-1)
+    unit = noise.clamp_min(1e-300).sqrt()[:, None]
+    left = problem.residual(theta.index_fill(1, torch.tensor([*own]), 0.0), problem.axes)[:, judged] / unit
+    does = torch.stack([problem.driven.own[own[j]][:, judged] / unit for j in named]) * sizes[:, None, None]
+    x, y = does.flatten(1), left.flatten()
+    found = sizes * torch.linalg.solve(x @ x.mT + torch.eye(len(x), dtype=x.dtype), x @ y)
+    return {own[j]: float(value) for j, value in zip(named, found, strict=True)}
