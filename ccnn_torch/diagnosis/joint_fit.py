@@ -8,7 +8,7 @@ they have to be: where a plate stands is no error of the machine, and what they 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -44,7 +44,10 @@ _RENEWALS = 2
 # Periods that are looked for of an effect that may have any, beside once a turn, which needs no search: a gear train
 # errs with more than one.
 _TIMES = 2
+# Groups of which it is fitted whether the rows are as probable without them, before all others are.
+_TRIED = 4
 _PARAMETERS, _FRAMES = "parameters", "frames"
+_Label = tuple[str, str]
 
 
 class JointFit(NamedTuple):
@@ -399,6 +402,21 @@ def _left_by_all(rows: _Rows, white: Whitening) -> tuple[Fits, Tensor]:
     return fit, rows.without_frames(white, left[..., None])[0][..., 0]
 
 
+def _gained_without(fit: Fits, groups: Mapping[_Label, Tensor], removed: Sequence[Sequence[_Label]]) -> Tensor:
+    """Log evidence that a fit gains without some of its groups, the scales of the others as they are: the density of
+    their coefficients at 0 after the rows over that before (Savage-Dickey ratio; Dickey 1971)."""
+    ends = torch.tensor([len(g) for g in groups.values()]).cumsum(0).tolist()
+    places = {label: torch.arange(end - len(g), end) for (label, g), end in zip(groups.items(), ends, strict=True)}
+    found = []
+    for labels in removed:
+        k = torch.cat([places[label] for label in labels])
+        # In units of the prior.
+        mean, spread = fit.mean[0, k] / fit.scale[0, k], torch.linalg.cholesky(fit.inverse[0][k][:, k])
+        far = torch.linalg.solve_triangular(spread, mean[:, None], upper=False).square().sum()
+        found.append(-0.5 * far - spread.diagonal().log().sum())
+    return torch.stack(found)
+
+
 def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
     """The effects whose marginal likelihood pays for them, one after the other."""
     grams, groups = rows.grams(white), rows.grouped
@@ -408,12 +426,22 @@ def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
         removed = [[n for n in names if n[0] == name and part in ("", n[1])] for name, part in names]
         if not removed:
             break
-        sets = [[g for label, g in groups.items() if label not in gone] for gone in ([], *removed)]
-        evidence = fit_sets(grams, sets, 0.0).log_evidence
         # An effect costs its place in the library; what is secondary in one that is there is as likely there as not.
-        gain = evidence[1:] - evidence[0] - torch.tensor([0.0 if part else EFFECT for _, part in names])
-        best = int(gain.argmax())
-        if float(gain[best]) < 0:
+        worth = torch.tensor([0.0 if part else EFFECT for _, part in names])
+        gain = _gained_without(fit_sets(grams, [[*groups.values()]], 0.0), groups, removed) - worth
+        order = gain.argsort(descending=True).tolist()
+        # Those that gain most with the scales as they are, and all before none is said to.
+        for some in (order[:_TRIED], order[_TRIED:]):
+            sets = [[g for label, g in groups.items() if label not in removed[k]] for k in some]
+            evidence = fit_sets(grams, [[*groups.values()], *sets], 0.0).log_evidence
+            gain[some] = evidence[1:] - evidence[0] - worth[some]
+            # An effect stays until its idle parts are gone, whose number is no evidence against what is left of it.
+            idle = {name for (name, part), g in zip(names, gain.tolist(), strict=True) if part and g >= 0}
+            some = [k for k in some if names[k][1] or names[k][0] not in idle]
+            best = max(some, key=lambda k: float(gain[k]), default=-1)
+            if best >= 0 and float(gain[best]) >= 0:
+                break
+        else:
             break
         groups = {label: g for label, g in groups.items() if label not in removed[best]}
     kept = torch.zeros(rows.model.size, dtype=torch.bool)

@@ -47,6 +47,24 @@ def members(mechanism: Mechanism) -> list[Member]:
     return list(found.values())
 
 
+def like_parts(mechanism: Mechanism) -> list[Member]:
+    """Lengths that every leg has one of, all legs together: rods, or the joints' places on a base, which is one body.
+
+    They are known by their names, less the number of the leg and a coordinate's letter: `A1x`, `Ax1` and `A_1` are `A`.
+    """
+    found: dict[str, Member] = {}
+    legs: dict[str, set[int]] = {}
+    inner = inside(mechanism)
+    for k in own_parameters(inner):
+        parameter = inner.geometry[k]
+        if parameter.unit == "m" and parameter.leg is not None:
+            whole = parameter.name.replace(str(parameter.leg), "", 1).replace("_", "")
+            name = f"all {whole.rstrip('xyz') or whole}"
+            found.setdefault(name, Member(name, [], None, None)).lengths.append(k)
+            legs.setdefault(name, set()).add(parameter.leg)
+    return [part for part in found.values() if len(legs[part.name]) > 1]
+
+
 def _weights(arm: SerialArm, joints: Tensor, values: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     """Where an arm's links weigh in the base frame, `... x n x 3` [m], and their shares, `n` [1]; evenly at their ends
     `... x n x 3` [m] where their masses are not known."""

@@ -13,7 +13,7 @@ from ccnn_torch.coordinates import is_temperature
 from ccnn_torch.effects.columns import TWIST, OfJoints, by_joint, of_rows, shown_columns
 from ccnn_torch.effects.constant import frame_columns
 from ccnn_torch.effects.joints import JointOffset
-from ccnn_torch.effects.loads import Member, members
+from ccnn_torch.effects.loads import Member, like_parts, members
 from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import REFERENCE, Situation
 from ccnn_torch.mechanisms import Mechanism
@@ -203,7 +203,11 @@ class Thermal(Effect):
                 for j in mechanism.joints
                 if j.unit == "m"
             ]
-        following = found[: 1 + len(_apart(mechanism)) + sum(j.unit == "m" for j in mechanism.joints)]
+        following = [c for c in found[: 1 + len(_apart(mechanism))]]
+        bodies = [Coefficient(p.name, "1/K", _STEEL, secondary=True, part=p.name) for p in like_parts(mechanism)]
+        drives = [c for c in found if c.name.endswith((" travel", " mount"))]
+        found += bodies
+        following = [*following, *bodies, *drives]
         found += [
             replace(
                 c, name=f"{c.name} {name.partition('_')[2]}", secondary=True, positive=False, part=f"{name} {c.name}"
@@ -244,24 +248,30 @@ class Thermal(Effect):
         travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
         following = [whole, *apart, travel]
         timed = [whole, whole, jacobian, *following] if _timed(situation) else []
-        return torch.cat([*following, jacobian, whole, *timed, *following * len(situation.thermometers)], -1)
+        bodies = [longer[..., p.lengths].sum(-1, keepdim=True) for p in like_parts(mechanism)]
+        others = [whole, *apart, *bodies, travel, jacobian] * len(situation.thermometers)
+        return torch.cat([*following, jacobian, whole, *timed, *bodies, *others], -1)
 
     def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
         """What each of the fixed columns is multiplied by: warmth [K], or what has become of it, `... x s x m`."""
         mechanism = situation.mechanism
         warm = situation.temperature.expand(situation.joints.shape[:-1]) - REFERENCE
-        others = [situation.covariates[name] - REFERENCE - warm for name in situation.thermometers]
+        others = [situation.covariates[name] - REFERENCE for name in situation.thermometers]
         n, sliding = len(mechanism.joints), sum(j.unit == "m" for j in mechanism.joints)
         following, one = 1 + len(_apart(mechanism)) + sliding, torch.ones_like(warm)
+        bodies = len(like_parts(mechanism))
         if not _timed(situation):
-            kinds = [(warm, following + n), (one, 1)]
+            kinds = [(warm, following + n), (one, 1), (warm, bodies)]
         else:
             time = situation.covariates["time"]
             body, core = (lagged(time, warm, shape[..., k]) for k in (0, 1))
             own = -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
             kinds = [(body, following + n), (one, 1), (warm, 1), (core, 1), (warm - body, n), (own, following)]
+            kinds.append((body, bodies))
             others = [lagged(time, other, shape[..., 0]) for other in others]
-        kinds += [(other, following) for other in others]
+        for other in others:
+            # A screw is as warm as its own thermometer; what a leg's shows is beside the growth of the whole machine.
+            kinds += [(other - kinds[0][0], following - sliding + bodies), (other, sliding + n)]
         each = torch.stack(torch.broadcast_tensors(*(k for k, _ in kinds)), -1)  # type: ignore[no-untyped-call]
         return each[..., [i for i, (_, count) in enumerate(kinds) for _ in range(count)]]
 

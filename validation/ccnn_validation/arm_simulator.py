@@ -1,12 +1,28 @@
 """The arm of the data sheet under PD with feedforward: rigid links, dry friction, give of the gears."""
+
 import numba
 import numpy as np
 
-EACH = {"kp": (6e3, 6e3, 2200, 0.1), "kd": (220, 220, 70, 0.15), "forward": (0.8, 0.8, 0.8, 0.2),
-        "balance": (0.8, 0.8, 0.8, 0.2), "motor": (0.6, 0.6, 0.25, 0.15), "dry": (8, 8, 4, 0.5),
-        "rest": (1.5, 1.5, 0.8, 1), "wet": (12, 12, 5, 0.5), "give": (4e-5, 4e-5, 1e-4, 0.5)}
-ONE = {"m2": (6.0, 0.1), "c2": (0.18, 0.1), "m3": (5.5, 0.1), "c3": (0.15, 0.15), "load": (2.0, 0.2),
-       "base": (0.15, 0.3), "delay": (4e-3, 0.5)}
+EACH = {
+    "kp": (6e3, 6e3, 2200, 0.1),
+    "kd": (220, 220, 70, 0.15),
+    "forward": (0.8, 0.8, 0.8, 0.2),
+    "balance": (0.8, 0.8, 0.8, 0.2),
+    "motor": (0.6, 0.6, 0.25, 0.15),
+    "dry": (8, 8, 4, 0.5),
+    "rest": (1.5, 1.5, 0.8, 1),
+    "wet": (12, 12, 5, 0.5),
+    "give": (4e-5, 4e-5, 1e-4, 0.5),
+}
+ONE = {
+    "m2": (6.0, 0.1),
+    "c2": (0.18, 0.1),
+    "m3": (5.5, 0.1),
+    "c3": (0.15, 0.15),
+    "load": (2.0, 0.2),
+    "base": (0.15, 0.3),
+    "delay": (4e-3, 0.5),
+}
 NAMES = [f"{name}{k + 1}" for name in EACH for k in range(3)] + list(ONE)
 START = np.array([x for value in EACH.values() for x in value[:3]] + [value[0] for value in ONE.values()], dtype=float)
 SIZES = START * np.array([value[3] for value in EACH.values() for _ in range(3)] + [s for _, s in ONE.values()])
@@ -16,7 +32,16 @@ SIZES = START * np.array([value[3] for value in EACH.values() for _ in range(3)]
 def driven(c, step, p):
     """Positions by set points `s x 3`; steps of about 1 ms, friction and damping implicit."""
     kp, kd, forward, balance, motor, dry, rest, wet, give = (
-        p[0:3], p[3:6], p[6:9], p[9:12], p[12:15], p[15:18], p[18:21], p[21:24], p[24:27])
+        p[0:3],
+        p[3:6],
+        p[6:9],
+        p[9:12],
+        p[12:15],
+        p[15:18],
+        p[18:21],
+        p[21:24],
+        p[24:27],
+    )
     m2, c2, m3, c3, load, base, delay = p[27], p[28], p[29], p[30], p[31], p[32], p[33]
     k2, k3 = np.sqrt(0.09 / 6.0), np.sqrt(0.08 / 5.5)
     weights = np.array([m2 / 2, m2 / 2, m3 / 2, m3 / 2, load])
@@ -43,7 +68,7 @@ def driven(c, step, p):
             angle = q[1] + q[2] if second else q[1]
             ur, uz = along[n] * np.cos(angle), along[n] * np.sin(angle)
             turn = v[1] + v[2] if second else v[1]
-            ar, az = -turn**2 * ur, -turn**2 * uz
+            ar, az = -(turn**2) * ur, -(turn**2) * uz
             r, z, r3, z3 = ur, uz, 0.0, 0.0
             if second:
                 r, z, r3, z3 = ur + er, uz + ez, -uz, ur
@@ -64,8 +89,13 @@ def driven(c, step, p):
         for n in range(3):
             whole[n] = m[n, n] + motor[n] + h * (wet[n] + kd[n])
             held = 0.0 if n == 0 else held2 if n == 1 else held3
-            push[n] = m[n, 0] * v[0] + m[n, 1] * v[1] + m[n, 2] * v[2] + motor[n] * v[n] + h * (
-                kp[n] * (ref[n] - q[n]) + kd[n] * forward[n] * fed[n] + balance[n] * held - bias[n] - weight[n])
+            push[n] = (
+                m[n, 0] * v[0]
+                + m[n, 1] * v[1]
+                + m[n, 2] * v[2]
+                + motor[n] * v[n]
+                + h * (kp[n] * (ref[n] - q[n]) + kd[n] * forward[n] * fed[n] + balance[n] * held - bias[n] - weight[n])
+            )
             most[n], brake[n] = h * max(dry[n] + rest[n] * np.exp(-((v[n] / 0.05) ** 2)), 0.0), 0.0
         below = whole[1] * whole[2] - m[1, 2] ** 2
         free[0, 0], free[1, 1], free[2, 2] = 1 / whole[0], whole[2] / below, whole[1] / below
