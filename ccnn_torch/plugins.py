@@ -31,6 +31,16 @@ def is_plugin(spec: str) -> bool:
     return ".py:" in spec
 
 
+def names_code(description: object) -> bool:
+    """Whether what a model file holds of a machine names a class in a Python file, at any depth."""
+    return is_plugin(str(description))
+
+
+def permission(needed: bool) -> str:
+    """The end of a command line that takes a model: ` --allow-code` where that names code, else nothing."""
+    return " --allow-code" if needed else ""
+
+
 @contextmanager
 def code_refused(source: str, allow_code: bool = False) -> Iterator[None]:
     """Within it `load_plugin` runs nothing: a file from outside may name no code that its reader has not allowed.

@@ -107,6 +107,16 @@ def test_missing_words_and_files_are_said_in_one_sentence(cli: Cli, tmp_path: Pa
     refused(cli("run", EXPERIMENTS / "records.yaml", "records=none.csv", "mechanism=tripd"), "tripd", "tripod")
 
 
+def test_a_change_may_be_longer_than_the_name_of_a_file(cli: Cli) -> None:
+    keys = f"mechanism_keys={{{', '.join(f'key_{i}: 0.1' for i in range(40))}}}"
+    refused(cli("diagnose", keys), "--out DIR")
+    refused(cli("run", keys), "no data is named")
+    refused(cli("start", keys), "RECORDS.csv")
+    files = ",".join(f"none_{i}.csv" for i in range(40))
+    for words in ((f"records={files}",), ("--records", files)):
+        refused(cli("diagnose", *words, "--mechanism", "tripod", "--out", "out"), "none_0.csv: there is no such file")
+
+
 def test_bad_records_are_refused_by_file_row_and_column(cli: Cli, tmp_path: Path) -> None:
     def run(path: Path, *words: str) -> tuple[int, str, str]:
         out = tmp_path / "run"

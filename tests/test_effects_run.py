@@ -353,6 +353,28 @@ def test_keys_that_do_not_go_together(played: Path, tmp_path: Path) -> None:
     assert made.compensator().machine is None
 
 
+def test_it_says_that_no_growth_by_the_thermometers_pays(tmp_path: Path) -> None:
+    machine, generator = load_mechanism("tripod"), torch.Generator().manual_seed(2)
+    joints = machine.sample_joints(80, generator)
+    pose = machine.forward_kinematics(joints) + 2e-6 * torch.randn(80, 3, generator=generator, dtype=torch.float64)
+    warm = 293 + 5 * torch.rand(80, 2, generator=generator, dtype=torch.float64)
+    columns = dict(zip(("temperature_base[K]", "temperature_rods[K]"), warm.numpy().T, strict=True))
+    about = {"mechanism": "tripod", "methods": ["constant"], "geometry": "none", "effects": ["joint_gain", "thermal"]}
+    told = "Thermal growth was tried with temperature_base, temperature_rods and does not pay."
+    longer = machine.nominal * (1 + 1e-4 * (warm.mean(-1, keepdim=True) - 293))
+    growth = machine.forward_kinematics(joints, longer) - machine.forward_kinematics(joints)
+    for name, there in (("still", pose), ("grown", pose + growth)):
+        rows = torch.cat([joints, there], -1).numpy().T
+        headers = [c.header for c in (*machine.joints, *machine.pose)]
+        write_table(tmp_path / f"{name}.csv", dict(zip(headers, rows, strict=True)) | columns)
+        notes = prepare(RunConfig.from_keys(records=str(tmp_path / f"{name}.csv"), **about)).notes
+        assert (told in notes) is (name == "still")
+    # Nothing was told of temperatures, and nothing is said of them.
+    write_table(tmp_path / "plain.csv", dict(zip(headers, torch.cat([joints, pose], -1).numpy().T, strict=True)))
+    plain = prepare(RunConfig.from_keys(records=str(tmp_path / "plain.csv"), **about | {"effects": "auto"})).notes
+    assert not any("Thermal" in note for note in plain)
+
+
 def test_lengths_grow_on_beyond_the_temperatures_that_were_measured(cli: Cli, tmp_path: Path) -> None:
     """Half their range farther on both sides, and where `compensation.ends` says so up to there."""
     words = (

@@ -25,7 +25,7 @@ from ccnn_torch.display import typed_path
 from ccnn_torch.errors import MethodFailedError, WriteError
 from ccnn_torch.mechanisms import Instrument
 from ccnn_torch.mechanisms.drawn import drawn
-from ccnn_torch.plugins import is_plugin
+from ccnn_torch.plugins import is_plugin, names_code
 from ccnn_torch.report.arrays import ARRAYS_FILE, RunArrays, load_arrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.results.run import ModelFiles, RunResults
@@ -149,7 +149,8 @@ def _save_models(calibration: Calibration, folder: RunFolder) -> ModelFiles:
         chosen = chosen or method
         if share < 1:
             damped[method] = share
-    return ModelFiles(method=chosen, without=without, damped=damped)
+    named = names_code(calibration.mechanism().describe())
+    return ModelFiles(method=chosen, without=without, damped=damped, allow_code=named)
 
 
 def _arrays(calibration: Calibration) -> RunArrays:

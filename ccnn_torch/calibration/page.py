@@ -17,6 +17,7 @@ from typing import Any
 from ccnn_torch.display import count_text, display_unit, number_text, typed_path, with_unit
 from ccnn_torch.files.write import write_rows, write_whole
 from ccnn_torch.files.yaml_file import read_yaml
+from ccnn_torch.plugins import permission
 from ccnn_torch.report.page import Answer, InlineFigure, Page, sections_of
 from ccnn_torch.report.results.base import Spread, interval_text, removed_percent
 from ccnn_torch.report.results.run import Before, Method, MethodPose, ModelFiles, Mse, RmsMax, RunResults
@@ -71,6 +72,7 @@ def _answers(results: RunResults, folder: Path | None) -> list[Answer]:
             return [*told, Answer("Next", says, (line,))]
         if results.model is not None and results.model.method is not None:
             line = f"ccnn compensate {shlex.quote(f'{path}/model.safetensors')} TARGETS.csv COMMANDS.csv --pose"
+            line += permission(results.model.allow_code)
             told.append(Answer("Next", "correct targets by this model.", (line,)))
         line = f"ccnn identify {shlex.quote(f'{path}/config.yaml')} out={shlex.quote(f'{path}_numbers')}"
         told.append(Answer("To enter", "the model holds its numbers; those to type into a controller:", (line,)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.calibration.dataset import Dataset, pad_rows, rows_of
 from ccnn_torch.compensation import Machine, machine_of
+from ccnn_torch.coordinates import is_temperature
 from ccnn_torch.diagnosis.from_file import (
     TRAINING_ROWS,
     Known,
@@ -26,6 +28,7 @@ from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.display import short_path
 from ccnn_torch.effects import (
     Acting,
+    Effect,
     Situation,
     default_gravity,
     labelled,
@@ -36,7 +39,7 @@ from ccnn_torch.effects import (
     used_covariates,
     without_pose_effects,
 )
-from ccnn_torch.effects.time import FrameDrift, elapsed
+from ccnn_torch.effects.time import FrameDrift, Thermal, elapsed
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm, fit_unknown, judge_frames
 from ccnn_torch.mechanisms.frames.partial import completed
@@ -381,6 +384,7 @@ def search_effects(
     effects = [e for e in asked if e.name in kept] + ([FrameDrift()] if drifts else [])
     loose = loose_parameters(situation.mechanism, identify)
     known = effects_that_pay(situation, few.pose, effects, fine, loose) if effects else []
+    notes = [*_thermal_note(situation, effects, known), *notes]
     if not known:
         return None, ["Effects were searched in the training rows, and none pays.", *notes]
     acting, _ = fit_jointly(situation, few.pose, known, fine, loose)
@@ -393,3 +397,10 @@ def search_effects(
     said = ", ".join(dict.fromkeys(name for name, _ in numbers))
     notes = [f"Effects without which the training rows would be less probable: {said}.", *notes]
     return replace(named, effects=tuple(numbers)), notes
+
+
+def _thermal_note(situation: Situation, tried: Sequence[Effect], known: Sequence[Known]) -> list[str]:
+    """A sentence where temperatures were measured and no growth by them pays: who measured them expects it."""
+    names = {e.name for e in tried} - {k.effect.name for k in known}
+    told = ", ".join(name for name in situation.covariates if is_temperature(name))
+    return [f"Thermal growth was tried with {told} and does not pay."] if Thermal.name in names and told else []

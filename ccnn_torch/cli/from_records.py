@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -260,7 +261,7 @@ def diagnose(
     ccnn diagnose --since runs/ur10/model.safetensors new.csv --out runs/ur10_now
     """
     first = Path(overrides[0]) if overrides else None
-    if overrides and first and records is None and (first.suffix.lower() in _TABLES or first.is_dir()):
+    if overrides and first and records is None and (first.suffix.lower() in _TABLES or os.path.isdir(first)):
         records, overrides = overrides[0], overrides[1:]
     with loading():
         from ccnn_torch.diagnosis.job import run_diagnosis

@@ -69,8 +69,8 @@ def config_and_changes(words: Sequence[object], option: Path | None, **given: ob
         InputError: several configs are named.
     """
     texts = [str(word) for word in words if word is not None]
-    # A file may have an = in its name; only the first word can be one.
-    first = [Path(text) for text in texts[:1] if "=" not in text or Path(text).is_file()]
+    # A file may have an = in its name; only the first word can be one. os.path: a change may be too long for a name.
+    first = [Path(text) for text in texts[:1] if "=" not in text or os.path.isfile(text)]
     if first and option is not None:
         raise InputError(f"two configs are given, {first[0]} and --config {option}; name one")
     written = {key: value if isinstance(value, str) else json.dumps(value) for key, value in given.items()}

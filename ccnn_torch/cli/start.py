@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -64,7 +65,7 @@ def start(
 
     ccnn start --out runs/arm --new next_week.csv
     """
-    if records is not None and "=" in str(records) and not records.is_file():
+    if records is not None and "=" in str(records) and not os.path.isfile(records):
         records, overrides = None, [str(records), *(overrides or [])]
     out = out or _folder_of(records)
     asks = not yes and not quiet and sys.stdin is not None and sys.stdin.isatty()

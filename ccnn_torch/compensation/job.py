@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ccnn_torch.compensation.model_files.load import LoadedModel
+from ccnn_torch.compensation.model_files.load import TOGETHER, LoadedModel
 from ccnn_torch.compensation.model_files.metadata import Array
 from ccnn_torch.compensation.outputs import DAMPED
 from ccnn_torch.coordinates import Coordinate
@@ -40,6 +40,7 @@ class Compensated:
     Attributes:
         rows: how many were written.
         outside: how many are outside the domain.
+        beyond: names of the inputs by which they are, as of `LoadedModel.beyond`.
         damped: how many have a damped command.
         fallback: how many violate the limits of the model's card; `first` names the first.
         lost: which were left out, since the machine does not reach their pose, in words; empty without any.
@@ -53,6 +54,7 @@ class Compensated:
     fallback: int = 0
     first: str = ""
     branch: str = ""
+    beyond: set[str] = field(default_factory=set)
 
 
 def is_of_motion(path: Path) -> bool:
@@ -149,6 +151,9 @@ def write_compensated(
             names = {header.partition("[")[0] for header in added}
             write({header: cells for header, cells in columns.items() if header.partition("[")[0] not in names} | added)
             _count(result, table, np.flatnonzero(there), found, back)
+            at = joints if back else found["command"]
+            out = ~found["ideal_inside_domain" if back else "inside_domain"] & ~found["fallback"]
+            result.beyond |= loaded.beyond(at[out], None if covariates is None else covariates[out])
         if poses is not None and poses.lost:
             hint = f", or give guess_{loaded.joints[0].header}… near the solution" if poses.chooses else ""
             result.lost = (
@@ -228,19 +233,23 @@ def sentences(output: Path, found: Compensated, model: LoadedModel) -> list[str]
     """What was written, and how many rows are outside the domain or damped."""
     said = [f"{output}: {found.rows} rows written."]
     if found.outside:
+        names = [c.name for c in (*model.joints, *model.covariates)]
+        by = ", ".join(name for name in [*names, TOGETHER] if name in found.beyond)
+        by = by and f" in {by}"
         what, then = "what was measured", "what was learned fades there, geometry and effects hold"
         if model.machine is not None:
             # Geometry alone holds all over the workspace, measured or not.
             measured = len(model.machine.joints) > 0
             what = what if measured else "the joints of the identified machine"
             then = "geometry and effects hold there too" if measured else "its geometry holds there too"
-        ends, names = model.facts.get("machine", {}).get("ends", {}), [c.name for c in model.covariates]
-        held, told = ([name for name in names if (name in ends) == wide] for wide in (False, True))
+        ends = model.facts.get("machine", {}).get("ends", {})
+        far = [c.name for c in model.covariates if c.name in found.beyond]
+        held, told = ([name for name in far if (name in ends) == wide] for wide in (False, True))
         if held:
             then += f", with {', '.join(held)} held at the ends of what was measured"
         if told:
             then += f"{' and' if held else ', with'} {', '.join(told)} at wider ones (machine.ends of the card)"
-        said.append(f"{found.outside} of them {_is(found.outside)} outside {what} (inside_domain = 0): {then}.")
+        said.append(f"{found.outside} of them {_is(found.outside)} outside {what}{by} (inside_domain = 0): {then}.")
     if found.damped:
         said.append(
             f"{found.damped} of them {_is(found.damped)} near a singular pose or at a limit of the joints "

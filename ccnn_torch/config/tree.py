@@ -117,7 +117,8 @@ def _changed(key: str, value: Any, change: Callable[[str], str]) -> Any:
 
 def listed_files(text: str, folder: Path) -> str | list[str]:
     """Records as a text: one file, or several as ``a.csv,b.csv``, also in brackets."""
-    if (folder / Path(text).expanduser()).exists():
+    # os.path: a list may be too long for a name.
+    if os.path.exists(folder / Path(text).expanduser()):
         return text
     parts = [part.strip(" '\"") for part in text.strip().removeprefix("[").removesuffix("]").split(",")]
     return parts if len(parts) > 1 and all(Path(part).suffix for part in parts) else text

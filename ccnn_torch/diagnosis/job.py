@@ -27,6 +27,7 @@ from ccnn_torch.effects.time import Homing
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.mechanisms import Mechanism, load_mechanism, simulated_rows
+from ccnn_torch.plugins import names_code, permission
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.screen import say_place, stdout, step_bar
@@ -190,12 +191,14 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
         keys["covariates"] = f"[{','.join(covariates)}]"
     keys["out"] = f"{typed_path(str(path.parent))}_compensator"
     run = " ".join(["ccnn run", *(shlex.quote(f"{key}={value}") for key, value in keys.items())])
+    own = names_code(diagnosis.analysis.situation.mechanism.describe())
+    rest = f"TARGETS.csv COMMANDS.csv --pose{permission(own)}"
     if diagnosis.machine is None:
         model = shlex.quote(f"{keys['out']}/model.safetensors")
         sentence = "No model holds these effects by themselves: these lines learn the gap and correct targets."
-        return sentence, run, f"ccnn compensate {model} TARGETS.csv COMMANDS.csv --pose"
+        return sentence, run, f"ccnn compensate {model} {rest}"
     sentence = "the first line corrects targets by these effects alone, the second one trains a model of all that pays."
-    return sentence, f"ccnn compensate {shlex.quote(typed_path(str(path)))} TARGETS.csv COMMANDS.csv --pose", run
+    return sentence, f"ccnn compensate {shlex.quote(typed_path(str(path)))} {rest}", run
 
 
 def _records(config: DiagnoseConfig) -> str:

@@ -12,6 +12,7 @@ from ccnn_torch.compensation.targets.machines import klipper_numbers
 from ccnn_torch.display import count_text, display_unit, number_text, own_unit, to_enter, with_unit
 from ccnn_torch.files.write import write_rows
 from ccnn_torch.identification.judge import figure_text
+from ccnn_torch.plugins import permission
 from ccnn_torch.records.formats.klipper import STEPPERS
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
 from ccnn_torch.report.json_files import read_json
@@ -183,6 +184,7 @@ def _answers(results: Block, folder: str | None) -> list[Answer]:
         said.append(Answer("Enter in printer.cfg", ("" if sure else doubt) + printer.note, lines))
     if folder is not None and not results["simulated"] and results["methods"][results["method"]]["converged"]:
         line = f"ccnn compensate {shlex.quote(f'{folder}/identified.yaml')} TARGETS.csv COMMANDS.csv --pose"
+        line += permission(results.get("allow_code", False))
         said.append(Answer("Next", "correct targets by the identified machine.", (line,)))
     return said
 

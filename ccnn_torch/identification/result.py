@@ -29,6 +29,7 @@ from ccnn_torch.identification.solve import (
     pieces_of,
 )
 from ccnn_torch.mechanisms import Giving, PoseError, SetUps
+from ccnn_torch.plugins import names_code
 from ccnn_torch.verification.promise import configurations, of_whole, promise_block
 from ccnn_torch.version import __version__
 
@@ -143,6 +144,7 @@ def assemble(
         "name": config.name,
         "seed": config.seed,
         "mechanism": measured.mechanism.name,
+        "allow_code": names_code(measured.mechanism.describe()),
         "machines": measured.machines,
         "simulated": measured.truth is not None,
         "rows": {

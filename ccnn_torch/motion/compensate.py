@@ -22,6 +22,8 @@ _FEWEST = 20
 _ABSURD = 3.0
 # Share of the error that a correction must take away to be sent.
 _GAINED = 0.1
+# Share of a run's error above which most of it stays.
+_MOST = 0.5
 # Share of the largest speed above which a motion does not begin at rest.
 _MOVING = 0.1
 
@@ -37,7 +39,8 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
         allow_code: as of `load_identified`.
 
     Returns:
-        A sentence for each joint: what its error is predicted to be; and what was assumed.
+        A sentence for each joint: what its error is predicted to be; for each of several runs, where most of it stays;
+        and what was assumed.
 
     Raises:
         InputError: a file is not there or not in this form, or the model errs by more than any machine would.
@@ -50,25 +53,19 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
     around, sentences = _around(found, table)
     runs = runs_of(table)
     command, position, plain = (np.empty_like(wanted) for _ in range(3))
-    for name, rows in runs:
+    useless = np.zeros((len(runs), len(names)), dtype=np.bool_)
+    for k, (name, rows) in enumerate(runs):
         refuse_time(table, rows, time[rows])
         if len(rows) < _FEWEST:
             raise InputError(f"{name}: {len(rows)} rows are no motion; give at least {_FEWEST}")
         own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], around.at(rows), found.errors)
         _refuse_absurd(model, name, found, wanted[rows], own.plain)
         command[rows], position[rows], plain[rows] = own.command, own.position, own.plain
-
-    def errs(q: Array) -> Array:
-        # What the model leaves stays, and adds to what the correction does.
-        return np.asarray(np.hypot(np.sqrt(np.square(wanted - q).mean(0)), found.left))
-
-    before, after = errs(plain), errs(position)
-    useless = after > (1 - _GAINED) * before
-    if useless.any():
-        command[:, useless] = wanted[:, useless]
-        for _, rows in runs:
+        before, after = (_errors(found, wanted[rows], q) for q in (own.plain, own.position))
+        useless[k] = after > (1 - _GAINED) * before
+        if useless[k].any():
+            command[rows] = np.where(useless[k], wanted[rows], own.command)
             position[rows] = moved(found.nominal, found.axes, time[rows], command[rows][None], around.at(rows))[0]
-        after = errs(position)
     added: dict[str, Array | list[str]] = {}
     for what, values in (("corrected", command), ("predicted", position)):
         for i, name in enumerate(names):
@@ -78,18 +75,51 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
         table.header(n): table.cells(n) for n in table.names if not n.startswith(("corrected", "predicted"))
     }
     write_table(output, kept | added)
-    said = []
+    said = _told(found, runs, wanted, plain, position, useless)
+    return said + [s for name, rows in runs for s in _begun(name, time[rows], wanted[rows])] + sentences
+
+
+def _errors(found: Identified, wanted: Array, position: Array) -> Array:
+    """RMS of each joint; what the model leaves stays, and adds to what the correction does."""
+    return np.asarray(np.hypot(np.sqrt(np.square(wanted - position).mean(0)), found.left))
+
+
+def _told(
+    found: Identified,
+    runs: list[tuple[str, NDArray[np.int64]]],
+    wanted: Array,
+    plain: Array,
+    position: Array,
+    useless: NDArray[np.bool_],
+) -> list[str]:
+    """A sentence for each joint on all runs, and where there are several one for each in which most of the error stays.
+
+    `useless`, runs `x n`: where a joint is not corrected.
+    """
+    said: list[str] = []
+    nowhere: NDArray[np.bool_] = np.asarray(useless.all(0))
+    before, after = (_errors(found, wanted, q) for q in (plain, position))
     for i, unit in enumerate(found.units):
         change = f"predicted {number_text(before[i], 3)}"
         beside = f"{number_text(found.left[i], 2)} of it the model's own error"
-        if useless[i]:
+        if nowhere[i]:
             said.append(
                 f"q{i + 1}: {change} {unit} RMS ({beside}), of which a correction would take away less than a "
                 "tenth: the wanted motion is sent as it is"
             )
         else:
             said.append(f"q{i + 1}: {change} -> {number_text(after[i], 3)} {unit} RMS ({beside})")
-    return said + [s for name, rows in runs for s in _begun(name, time[rows], wanted[rows])] + sentences
+    for uncorrected, (name, rows) in zip(useless, runs, strict=True):
+        before, after = (_errors(found, wanted[rows], q[rows]) for q in (plain, position))
+        # Where the model's own error is the larger part, as at rest, there is little to correct.
+        much = np.square(before) > 2 * np.square(found.left)
+        parts = []
+        for i in np.flatnonzero(much & (after > _MOST * before) & ~nowhere & (len(runs) > 1)).tolist():
+            sizes = number_text(before[i], 3) + ("" if uncorrected[i] else f" -> {number_text(after[i], 3)}")
+            then = "; the wanted motion is sent as it is" if uncorrected[i] else ""
+            parts.append(f"q{i + 1} ({sizes} {found.units[i]} RMS{then})")
+        said += [f"{name}: most of the error stays at {', '.join(parts)}"] if parts else []
+    return said
 
 
 def _around(found: Identified, table: Table) -> tuple[Around, list[str]]:

@@ -20,6 +20,7 @@ from ccnn_torch.motion.known import shares_of
 from ccnn_torch.motion.log import load_logs
 from ccnn_torch.motion.setting import nominal_of
 from ccnn_torch.motion.stretches import phases_of
+from ccnn_torch.plugins import is_plugin, permission
 
 _STEPS = {
     "reading the records": 1.0,
@@ -68,7 +69,8 @@ def _complete(config: DiagnoseConfig, folder: Path, found: MotionDiagnosis, quie
         write_rows(folder / NEXT, ["time[s]", f"command{number}[{data.units[0]}]"], map(list, rows))
     compensate = [
         "A wanted motion becomes the commands at which the machine follows it.",
-        f"ccnn compensate {typed_path(str(folder / IDENTIFIED))} MOTION.csv COMMANDS.csv",
+        f"ccnn compensate {typed_path(str(folder / IDENTIFIED))} MOTION.csv COMMANDS.csv"
+        + permission(is_plugin(found.nominal.name)),
     ]
     doubt = "; it may hold another cause" if in_doubt(found.content) else ""
     about = head_of(config, folder, config.motion, compensate if found.verdict["effects"] else []) | {

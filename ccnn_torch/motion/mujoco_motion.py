@@ -322,4 +322,6 @@ def _loaded(spec: Any, model: Any, tool: Tool, added: float) -> None:
     inertia = (turned * np.maximum(sizes, _LEAST)) @ turned.T
     body.explicitinertial, body.mass = True, mass + added
     body.ipos = centre + added / (mass + added) * between
+    # MuJoCo takes one form of it: what an <inertial> of the file has, diagonal and turned, goes.
+    body.inertia, body.ialt.type = np.zeros(3), mujoco.mjtOrientation.mjORIENTATION_QUAT
     body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]

@@ -152,6 +152,33 @@ def test_a_config_allows_it_by_a_key(identified: Path, ran: Callable[[], bool], 
     assert (code, err) == (0, "") and ran()
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "methods=[constant]", "geometry=none", "effects=none", "save_report=false"),
+        ("diagnose", "--effects", "joint_offset,joint_gain", "--no-network"),
+        ("identify",),
+    ],
+    ids=lambda words: words[0],
+)
+def test_the_line_that_is_printed_to_compensate_by_a_class_of_ones_own_runs(
+    own: Path, tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mechanism, generator = load_mechanism("tripod"), torch.Generator().manual_seed(0)
+    poses = mechanism.sample_workspace(60, generator)
+    joints = mechanism.solve_inverse(poses) + torch.tensor([1e-4, 0.0, -5e-5], dtype=torch.float64)
+    noise = 1e-6 * torch.randn(poses.shape, generator=generator, dtype=torch.float64)
+    headers = [c.header for c in (*mechanism.joints, *mechanism.pose)]
+    write_table(Path("rows.csv"), dict(zip(headers, torch.cat([joints, poses + noise], -1).numpy().T, strict=True)))
+    write_table(Path("TARGETS.csv"), dict(zip(headers[3:], poses[:5].numpy().T, strict=True)))
+    code, shown, err = cli(*words, "--records", "rows.csv", "--mechanism", f"{own.name}:Own", "--out", "found")
+    assert code == 0, err
+    line = next(line for line in shown.splitlines() if line.startswith("  ccnn compensate "))
+    code, _, err = cli(*line.split()[1:])
+    assert code == 0 and Path("COMMANDS.csv").is_file(), err
+
+
 def test_numbers_that_are_none_or_huge_leave_the_joints_as_they_are(tmp_path: Path) -> None:
     for name in ("tripod", "five_bar"):
         mechanism = load_mechanism(name)

@@ -111,6 +111,12 @@ def test_it_says_how_many_rows_are_outside(folder: Path, tmp_path: Path, ideal: 
     arguments = [str(folder / "model.onnx"), str(ideal), str(tmp_path / "out.csv")]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0 and "20 rows written" in result.output and "1 of them is outside" in result.output
+    flat = " ".join(result.output.split())
+    assert "1 of them is outside what was measured in q1, q2, q3 (inside_domain = 0)" in flat
+    # A corner of the box of the joints, which no pose of the machine is near.
+    model = load_model(folder / "model.safetensors")
+    corner = np.where([True, False, False], *model.region.T[::-1]) * 0.99 + 0.01 * model.middle
+    assert model.beyond(corner[None], None) == {"several inputs together"}
     assert CliRunner().invoke(app, [*arguments, "--quiet"]).output == ""
 
 

@@ -66,8 +66,16 @@ def test_it_says_that_rows_are_outside_what_was_measured(found: Path, tmp_path: 
     columns = {c.header: rows[:, i].numpy() for i, c in enumerate(model.joints)}
     write_table(tmp_path / "in.csv", columns | {c.header: [1.0, 1.0] for c in model.covariates})
     said, _ = compensate_table(model, tmp_path / "in.csv", tmp_path / "out.csv")
-    held = "load_x, load_y, direction1, direction2 held at the ends of what was measured."
-    assert said[1].endswith(f"(inside_domain = 0): geometry and effects hold there too, with {held}")
+    joints, load = ", ".join(c.name for c in model.joints), model.covariates[0].header
+    assert said[1].endswith(f" in {joints} (inside_domain = 0): geometry and effects hold there too.")
+    # Inputs are named that are beyond in those rows, and no others.
+    middle = {c.header: (low + high)[[i, i]] / 2 for i, c in enumerate(model.joints)}
+    beside = {c.header: [1.0, 1.0] for c in model.covariates}
+    write_table(tmp_path / "in.csv", middle | beside | {load: [1.0, 1e3]})
+    said, _ = compensate_table(model, tmp_path / "in.csv", tmp_path / "out.csv")
+    held = "load_x held at the ends of what was measured."
+    then = "geometry and effects hold there too, with"
+    assert said[1] == f"1 of them is outside what was measured in load_x (inside_domain = 0): {then} {held}"
 
 
 def test_it_is_a_mechanism(found: Path) -> None:

@@ -49,6 +49,24 @@ def test_a_command_stays_near_the_motion_and_an_absurd_model_is_refused(tmp_path
     assert code == 2 and "its q1 errs by" in said and "by at most 0.30 rad): it is not that machine" in said
 
 
+def test_every_run_of_a_file_is_corrected_for_itself_and_told_where_most_of_its_error_stays(
+    tmp_path: Path, cli: Cli
+) -> None:
+    # The motor is too weak for the second run, alone in a file and after another one.
+    keys, slow = KEYS | {"gravity_sin": 0.4, "torque_limit": 0.02}, {"command1[rad]": 0.1 * command(2, TIME)}
+    _, said, first = compensated(tmp_path, cli, keys, **slow)
+    assert "RMS" in said and "most of the error" not in said
+    _, alone, second = compensated(tmp_path, cli, keys)
+    assert "the wanted motion is sent as it is" in alone and "most of the error" not in alone
+    both = {name: np.r_[first[name], second[name]] for name in ("command", "corrected", "predicted")}
+    columns = {"time[s]": np.r_[TIME, TIME], "run[1]": np.repeat([1.0, 2.0], len(TIME))}
+    code, said, found = compensated(tmp_path, cli, keys, **columns, **{"command1[rad]": both["command"]})
+    assert code == 0 and all(np.allclose(found[name], both[name], atol=1e-9) for name in both)
+    assert "q1: predicted " in said and " -> " in said.split("most of")[0]
+    assert "in.csv run 2: most of the error stays at q1 (" in said and "run 1: most" not in said
+    assert "rad RMS; the wanted motion is sent as it is)." in said
+
+
 def test_an_axis_that_comes_late_by_more_than_a_delay_is_led_to_the_wanted_motion() -> None:
     # A delay and a lag, which no shift in time makes up for: a joint of frequencies up to 2 Hz.
     late = nominal_of("servo", {"gain": 1.0, "viscous": 0.05, "delay": 0.1}, ["rad"])

@@ -152,6 +152,28 @@ def test_a_mujoco_model_is_a_model_and_gets_the_new_values(tmp_path: Path) -> No
         nominal_of(str(model), {}, ["rad"])
 
 
+@pytest.mark.parametrize(
+    "form",
+    [
+        'diaginertia="1e-3 2e-3 2.5e-3"',
+        'diaginertia="1e-3 2e-3 2.5e-3" euler="0.1 0.2 0.3"',
+        'diaginertia="1e-3 2e-3 2.5e-3" quat="0.8 0 0.6 0"',
+        'fullinertia="1e-3 2e-3 2.5e-3 1e-4 0 0"',
+    ],
+)
+def test_a_body_whose_inertia_the_file_tells_gets_a_mass_at_the_tool(tmp_path: Path, form: str) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    model, new = write_mjcf(tmp_path / "model.xml"), tmp_path / "new.xml"
+    told = f'<inertial pos="0 0 -0.05" mass="0.2" {form}/><site pos="0 0 -0.1"/><geom'
+    model.write_text(model.read_text().replace("<geom", told))
+    nominal = nominal_of(str(model), {}, ["rad"])
+    axis = {"gain": 1.0, "coulomb": 0.0, "weakness": 0.0, **nominal.axes[0]}
+    write_new_values(str(model), new, [axis], nominal.gains, 0.1)
+    old, heavier = (mujoco.MjModel.from_xml_path(str(path)) for path in (model, new))
+    assert heavier.body_mass[1] == pytest.approx(0.3)
+    assert heavier.dof_M0[0] == pytest.approx(old.dof_M0[0] + 0.1 * 0.1**2, abs=1e-7)
+
+
 def arm(path: Path, payload: float = 0.0) -> Path:
     """Two links in a vertical plane, with a site at the flange and a payload there [kg]."""
     link = '<body pos="{x} 0 0"><joint name="{name}" axis="0 1 0" armature="0.05" damping="{damping}"/>'

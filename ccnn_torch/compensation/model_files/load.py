@@ -110,8 +110,13 @@ class Promise:
 
     def inside(self, inputs: Array) -> Array:
         """Whether inputs `s x d` [SI] are in the domain, `s`, bool."""
+        return np.asarray(self.within(inputs).all(-1))
+
+    def within(self, inputs: Array) -> Array:
+        """Whether inputs `s x d` [SI] are between each two edges, of the inputs and then of their principal directions,
+        `s x 2d`, bool."""
         y = ((inputs - self.centre) / self.half_range) @ self.directions.T
-        return np.asarray(((y >= self.least - _EDGE) & (y <= self.most + _EDGE)).all(-1))
+        return np.asarray((y >= self.least - _EDGE) & (y <= self.most + _EDGE))
 
 
 def as_matrix(values: ArrayLike, wanted: tuple[Coordinate, ...], what: str) -> Array:
@@ -215,6 +220,10 @@ def _of_kind(value: Any, shape: tuple[int, ...], kind: type) -> Array | None:
     return value if right else None
 
 
+TOGETHER = "several inputs together"
+"""What is beyond what was measured where no input is by itself."""
+
+
 @dataclass
 class LoadedModel:
     """A compensator out of a file, or an identified machine as one that has learned nothing.
@@ -288,6 +297,20 @@ class LoadedModel:
         if self.machine is not None:
             checked.pop("deviation_sd", None)
         return {name: value.reshape((*lead, *value.shape[1:])) for name, value in checked.items()}
+
+    def beyond(self, joints: Array, covariates: Array | None) -> set[str]:
+        """Names of the inputs that are beyond what was measured, margin included, in one of the rows; and `TOGETHER`
+        where each one is within, and several together are not.
+
+        Args:
+            joints: as commanded, `s x n` [SI].
+            covariates: `s x m` [SI]; None where there are none.
+        """
+        inputs = joints if covariates is None else np.concatenate([joints, covariates], -1)
+        alone, together = np.split(~self._promise.within(self._promise.cleaned(inputs)[0]), 2, axis=-1)
+        names = [c.name for c in (*self.joints, *self.covariates)]
+        found = {name for k, name in enumerate(names) if alone[:, k].any()}
+        return found | ({TOGETHER} if (together.any(-1) & ~alone.any(-1)).any() else set())
 
     def run(self, joints: Array, covariates: Array | None, ways: Collection[str] = WAYS) -> dict[str, Array]:
         """What the file itself gives for joints `s x n` and covariates `s x m`; raises what it likes."""

@@ -182,6 +182,8 @@ class IdentifiedResults(Result):
     name: str
     seed: int
     mechanism: str
+    allow_code: bool = False
+    """whether identified.yaml names a Python file, so that commands need --allow-code"""
     machines: int
     simulated: bool
     rows: RowCounts

@@ -196,6 +196,8 @@ class ModelFiles(Result):
     """why others have none"""
     damped: dict[str, float] = {}
     """share of what a method learned that its model files apply, where all of it was too steep for a command"""
+    allow_code: bool = False
+    """whether they name a Python file, so that commands with poses need --allow-code"""
 
 
 class RunResults(Result):
