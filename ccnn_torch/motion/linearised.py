@@ -134,8 +134,8 @@ def _left(problem: Problem, specs: Sequence[Spec], values: Values) -> float:
 def own_values(problem: Problem, specs: Sequence[Spec]) -> dict[str, float]:
     """What is added to those of a simulator's own parameters that some axis' set has: of each one value for all axes.
 
-    Least squares of what all axes leave beside the other effects of their sets, each weighed by what its own set leaves:
-    an axis that hardly shows a parameter has no say in it.
+    Least squares of what all axes leave beside the other effects of their sets, each weighed by what its own set
+    leaves: an axis that hardly shows a parameter has no say in it.
     """
     numbers, theta = problem.library.numbers[0], torch.stack([spec.theta for spec in specs])
     acts = {j: n.acts[0].parameter for j, n in enumerate(numbers) if n.acts}
@@ -146,8 +146,11 @@ def own_values(problem: Problem, specs: Sequence[Spec]) -> dict[str, float]:
     judged, sizes = problem.data.judged, theta.new_tensor([numbers[j].scale for j in named])
     noise = problem.residual(theta, problem.axes)[:, judged].square().mean(-1)
     unit = noise.clamp_min(1e-300).sqrt()[:, None]
-    left = problem.residual(theta.index_fill(1, torch.tensor([*own]), 0.0), problem.axes)[:, judged] / unit
-    does = torch.stack([problem.driven.own[own[j]][:, judged] / unit for j in named]) * sizes[:, None, None]
-    x, y = does.flatten(1), left.flatten()
-    found = sizes * torch.linalg.solve(x @ x.mT + torch.eye(len(x), dtype=x.dtype), x @ y)
+    without = theta.index_fill(1, torch.tensor([*own]), 0.0)
+    each = torch.stack([without, *(without.index_fill(1, torch.tensor([j]), 1.0) for j in named)])
+    left = problem.residual(each.flatten(0, 1), problem.axes.repeat(len(each)))[:, judged]
+    left = left.reshape(len(each), len(unit), -1) / unit
+    x, y = (left[0] - left[1:]).flatten(1), left[0].flatten()
+    low, high = (ends[0, named] for ends in problem.library.bounds)
+    found = sizes * torch.linalg.solve(x @ x.mT + torch.eye(len(x), dtype=x.dtype), x @ y).clamp(low, high)
     return {own[j]: float(value) for j, value in zip(named, found, strict=True)}
