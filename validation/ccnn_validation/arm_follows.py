@@ -156,7 +156,8 @@ def joints(at: Array) -> Array:
 
 def moves(places: Array, speeds: Array, rest: float) -> Array:
     """Ways between places [rad] at speeds [rad/s] of the fastest joint, S-curves, `SAMPLES`."""
-    t = np.cumsum(np.r_[0.3, *([np.abs(b - a).max() / s, rest] for a, b, s in zip(places[:-1], places[1:], speeds))])
+    ways = zip(places[:-1], places[1:], speeds, strict=True)
+    t = np.cumsum(np.r_[0.3, *([np.abs(b - a).max() / s, rest] for a, b, s in ways)])
     at = np.repeat(places, 2, 0)[: len(t) + 1]
     course = np.stack([np.interp(np.arange(SAMPLES) * STEP, np.r_[0, t], at[:, k]) for k in range(3)], -1)
     for width in (50, 25, 10):
@@ -172,7 +173,7 @@ def slopes(t: Array) -> Array:
 
 def logged(rng: np.random.Generator) -> list[Array]:
     """Set points of the three runs of the log, `s x 3` [rad]."""
-    t, runs = np.arange(SAMPLES) * STEP, []
+    t, runs = np.asarray(np.arange(SAMPLES) * STEP, float), []
     for _ in range(2):
         rate = 2 * np.pi * np.array([0.1, 0.2, 0.3, 0.5, 0.8, 1.3])
         size = rng.normal(0, 1, (6, 3)) / np.arange(1, 7)[:, None]
@@ -190,7 +191,7 @@ def logged(rng: np.random.Generator) -> list[Array]:
 
 def wanted(rng: np.random.Generator) -> dict[str, Array]:
     """The new runs, `s x 3` [rad]."""
-    t = np.arange(SAMPLES) * STEP
+    t = np.asarray(np.arange(SAMPLES) * STEP, float)
     places = []
     for side in (-1, 1, -1, 1):
         yaw, out, up = side * rng.uniform(0.3, 0.8), rng.uniform(0.57, 0.68), rng.uniform(-0.12, -0.02)
@@ -200,11 +201,11 @@ def wanted(rng: np.random.Generator) -> dict[str, Array]:
     angle = np.cumsum(slopes(t)[:, 0])
     angle = 4 * np.pi * angle / angle[-1] + rng.uniform(0, 6)
     yaw, tilt = rng.uniform(-0.4, 0.4), rng.uniform(0, np.pi)
-    out, side = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
-    steep = np.cos(tilt) * out + np.sin(tilt) * np.array([0, 0, 1])
-    middle = rng.uniform(0.6, 0.64) * out + np.array([0, 0, rng.uniform(0, 0.05)])
-    circle = middle + rng.uniform(0.07, 0.09) * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * steep)
-    way = rng.uniform(0.3, 1) * side + rng.uniform(-0.4, 0.4) * out + rng.uniform(-0.7, 0.7) * np.array([0, 0, 1])
+    ahead, beside = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
+    steep = np.cos(tilt) * ahead + np.sin(tilt) * np.array([0, 0, 1])
+    middle = rng.uniform(0.6, 0.64) * ahead + np.array([0, 0, rng.uniform(0, 0.05)])
+    circle = middle + rng.uniform(0.07, 0.09) * (np.cos(angle)[:, None] * beside + np.sin(angle)[:, None] * steep)
+    way = rng.uniform(0.3, 1) * beside + rng.uniform(-0.4, 0.4) * ahead + rng.uniform(-0.7, 0.7) * np.array([0, 0, 1])
     along = uniform_filter1d(np.clip(t - 0.7, 0, 8.6) - 4.3, 60, mode="nearest") * 0.03
     line = middle + along[:, None] * way / np.linalg.norm(way)
     return {"pick": pick, "circle": joints(circle), "line": joints(line)}
@@ -224,7 +225,8 @@ def earlier(course: Array, lag: Array) -> Array:
 def mean_lag(runs: list[Array], seen: list[Array]) -> Array:
     """By what each joint is late [s]."""
     speed = np.concatenate([smooth(run, 1) for run in runs])
-    return np.asarray((speed * np.concatenate([c - q for q, c in zip(seen, runs)])).sum(0) / (speed**2).sum(0))
+    ahead = np.concatenate([c - q for q, c in zip(seen, runs, strict=True)])
+    return np.asarray((speed * ahead).sum(0) / (speed**2).sum(0))
 
 
 def shifted(runs: list[Array], seen: list[Array], new: list[Array]) -> list[Array]:
@@ -254,12 +256,12 @@ def plain_script(runs: list[Array], seen: list[Array], new: list[Array]) -> list
     """Fit the simulated arm to the runs, and move the commands of new ones by the error that it predicts."""
 
     def residuals(u: Array) -> Array:
-        off = [driven(c, STEP, START + SIZES * u) - q for c, q in zip(runs, seen)]
-        return np.r_[np.concatenate(off)[::2].ravel() / 3e-4, u]
+        off = [driven(c, STEP, START + SIZES * u) - q for c, q in zip(runs, seen, strict=True)]
+        return np.asarray(np.r_[np.concatenate(off)[::2].ravel() / 3e-4, u])
 
     found = least_squares(residuals, np.zeros(len(START)), x_scale=1.0, diff_step=1e-4, max_nfev=15)
     numbers = START + SIZES * found.x
-    print("  " + " ".join(f"{n} {v:.4g}" for n, v in zip(NAMES, numbers)), file=sys.stderr)
+    print("  " + " ".join(f"{n} {v:.4g}" for n, v in zip(NAMES, numbers, strict=True)), file=sys.stderr)
     lag, corrected = mean_lag(runs, seen), []
     for goal in new:
         course, best = goal.copy(), (np.inf, goal)
@@ -275,7 +277,7 @@ def ours(folder: Path, name: str, runs: list[Array], seen: list[Array], new: lis
     """Commands of `ccnn diagnose --motion` and `ccnn compensate`; None where there are none."""
     folder.mkdir(parents=True, exist_ok=True)
     t, head = np.arange(SAMPLES) * STEP, ",".join(f"command{k}[rad]" for k in (1, 2, 3))
-    for i, (run, q) in enumerate(zip(runs, seen), 1):
+    for i, (run, q) in enumerate(zip(runs, seen, strict=True), 1):
         columns = f"time[s],{head},q1[rad],q2[rad],q3[rad]"
         np.savetxt(folder / f"run{i}.csv", np.c_[t, run, q], "%.9g", ",", header=columns, comments="")
     many = np.concatenate([np.c_[np.full(SAMPLES, i), t, run] for i, run in enumerate(new)])

@@ -38,7 +38,7 @@ def keys() -> str:
 
 def mjcf() -> str:
     """The data sheet as MJCF; speed that is fed forward lessens the drive's own damping, weight that is, the weight."""
-    drive = [f'armature="{m}" damping="{w}" frictionloss="{d}"' for m, w, d in zip(MOTOR, WET, DRY, strict=False)]
+    drive = [f'armature="{m}" damping="{w}" frictionloss="{d}"' for m, w, d in zip(MOTOR, WET, DRY, strict=True)]
     boxes = []
     for mass, centre, about in ((M2, C2, I2), (M3, C3, I3)):
         size = f"{np.sqrt(3 * about / mass - 0.049**2):.6g} 0.049 0.049"

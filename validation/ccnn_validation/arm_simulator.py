@@ -1,7 +1,15 @@
 """The arm of the data sheet under PD with feedforward: rigid links, dry friction, give of the gears."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numba
 import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 EACH = {
     "kp": (6e3, 6e3, 2200, 0.1),
@@ -29,7 +37,7 @@ SIZES = START * np.array([value[3] for value in EACH.values() for _ in range(3)]
 
 
 @numba.njit(cache=False)
-def driven(c, step, p):
+def driven(c: Array, step: float, p: Array) -> Array:
     """Positions by set points `s x 3`; steps of about 1 ms, friction and damping implicit."""
     kp, kd, forward, balance, motor, dry, rest, wet, give = (
         p[0:3],
@@ -122,9 +130,9 @@ def driven(c, step, p):
 
 
 class ARM:
-    parameters = dict(zip(NAMES, START.tolist(), strict=False))
+    parameters: ClassVar[dict[str, float]] = dict(zip(NAMES, START.tolist(), strict=True))
 
-    def simulate(self, time, commands, parameters):
+    def simulate(self, time: Array, commands: Array, parameters: Mapping[str, float]) -> Array:
         step = (time[-1] - time[0]) / (len(time) - 1)
         numbers = np.array([float(parameters[name]) for name in NAMES])
-        return driven(np.ascontiguousarray(commands), step, numbers)
+        return np.asarray(driven(np.ascontiguousarray(commands), step, numbers))

@@ -38,8 +38,8 @@ NOISE, NEW, LEAD, TEETH, STEEL, G = 1e-6, 400, 0.01, 90, 11.5e-6, 9.81
 SPHERES = np.array([[0.14, 0.02, 0.06], [-0.06, 0.13, 0.19], [-0.08, -0.12, 0.11], [0.03, -0.04, 0.22]])
 SWIVEL, ARMS = np.radians([-90.0, 20.0]), np.array([[0, 0.3, 0.55], [0, -0.3, 0.05], [0, 0, -0.6]])
 FIXED, LONGER = np.array([-0.35, -0.35, 0.4]), 0.08  # bearings of the screws that hold; the longer device [m]
-CAUSES = ("places", "square", "leads", "curve", "screw", "straight", "angular", "worm", "play", "encoder", "spindle")
-CAUSES += ("growth", "bed", "weight", "runout")
+CAUSES = ["places", "square", "leads", "curve", "screw", "straight", "angular", "worm", "play", "encoder", "spindle"]
+CAUSES += ["growth", "bed", "weight", "runout"]
 CONFIG = "mechanism: machine.yaml\n"
 NUMBERS = """numbers:
   offset_CA: 0 mm +- 0.2 mm
@@ -176,7 +176,7 @@ def drawn_table(joints: Array) -> Array:
 
 def day(rows: int, rng: np.random.Generator, ends: Array | None = None) -> tuple[Array, Array, Array, Array]:
     """Joints, places on the plate, which sphere, what is told; `ends` of temperatures: of new targets, in no order."""
-    angles = np.stack([rng.uniform(-np.pi, np.pi, rows), rng.uniform(*SWIVEL, rows)], -1)
+    angles = np.stack([rng.uniform(-np.pi, np.pi, rows), rng.uniform(SWIVEL[0], SWIVEL[1], rows)], -1)
     which = rng.permutation(np.arange(rows) % len(SPHERES))
     scatter = rng.normal(0, [0.1, 0.5, 0.3, 0.3, 0.3], (rows, 5))
     if ends is None:
@@ -189,7 +189,7 @@ def day(rows: int, rng: np.random.Generator, ends: Array | None = None) -> tuple
         at = rng.dirichlet(np.full(4, 0.7), rows) @ SPHERES
         temperature = ends[0] + (ends[1] - ends[0]) * np.clip(rng.uniform(0, 1, (rows, 1)) + scatter / 5, 0, 1)
     joints = np.c_[angles, np.zeros((rows, 3))]
-    joints[:, 2:] = times(drawn_table(joints), at + [0, 0, -0.03])
+    joints[:, 2:] = times(drawn_table(joints), at + np.array([0, 0, -0.03]))
     return joints, at, which, np.c_[temperature, np.sign(np.diff(joints, axis=0, prepend=joints[:1] - 1))]
 
 
@@ -245,7 +245,8 @@ def script(x: Array, joints: Array, told: Array, tools: Array) -> Array:
     centre = np.stack([zero, v["offset"] + zero, zero], -1) + tilt @ v["cradle"].reshape(2, 3)
     centre = times(cradle, centre + once @ v["run"].reshape(4, 3))
     plate = turn(*v["plate_turn"])
-    return times((table @ plate).swapaxes(1, 2), tool - centre) - plate[0].T @ (v["plate"] + [0, 0, -0.03])
+    off = plate[0].T @ (v["plate"] + [0, 0, -0.03])
+    return np.asarray(times((table @ plate).swapaxes(1, 2), tool - centre) - off)
 
 
 def script_fit(joints: Array, told: Array, seen: Array, long: Array, full: bool) -> tuple[Array, Array]:
@@ -257,7 +258,7 @@ def script_fit(joints: Array, told: Array, seen: Array, long: Array, full: bool)
         return seen - script(x, joints, told, long[:, None] / LONGER * (u[free:] * 1e-3 + [0, 0, LONGER]))
 
     def residuals(u: Array) -> Array:
-        return np.r_[left(u).ravel() / (1.5e-6 if full else 5e-6), u]
+        return np.asarray(np.r_[left(u).ravel() / (1.5e-6 if full else 5e-6), u])
 
     found = least_squares(residuals, np.zeros(free + 3)).x
     return np.r_[found[:free], np.zeros(len(SIZES) - free)] * SIZES, times(drawn_table(joints), left(found))
@@ -300,7 +301,7 @@ def judged(
     """RMS and largest of what one machine misses [m], by who calibrated it; NaN where there were no commands."""
     machine, rng = Machine(seed, without), np.random.default_rng([seed, 1])
     joints, _, which, told = day(rows, rng)
-    head = np.arange(rows) % heads
+    head = np.asarray(np.arange(rows) % heads, float)
     long = head * LONGER
     joints[:, 4] += long
     seen = machine.measured(joints, told, which, long, rng)
@@ -320,7 +321,7 @@ def judged(
         targets = table(wanted, then, np.empty((NEW, 0)), None, bed)
         config = CONFIG + NAMED * (who == "ours, named")
         with TemporaryDirectory() as folder:
-            place = Path(folder) if kept is None else kept / who.replace(", ", "_").replace(" ", "_")
+            place = Path(folder) if kept is None else kept / f"{seed}" / who.replace(", ", "_").replace(" ", "_")
             place.mkdir(parents=True, exist_ok=True)
             commands = commanded(place, text, records, targets, "run", config)
         sent[who] = np.full_like(wanted, np.nan) if commands is None else commands

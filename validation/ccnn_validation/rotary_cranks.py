@@ -31,8 +31,7 @@ class RotaryHexapod(Mechanism):
             for name, value in numbers.items():
                 kind = "rad" if name in ("lean_u", "lean_v", "offset") else "m"
                 size = next(size for start, size in TOLERANCES.items() if name.startswith(start))
-                scale = {"scale": size} if told else {}
-                geometry.append(Parameter(f"{name}{leg + 1}", kind, value, leg + 1, **scale))
+                geometry.append(Parameter(f"{name}{leg + 1}", kind, value, leg + 1, scale=size if told else None))
             across.append([side * math.sin(pair), -side * math.cos(pair), 0.0])
         self.across = torch.tensor(across, dtype=torch.float64)
         super().__init__(
@@ -45,7 +44,7 @@ class RotaryHexapod(Mechanism):
             home_joints=[0.0] * 6,
         )
 
-    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:  # type: ignore[override]
         """Angles of the cranks at a pose, `... x 6`."""
         values = self.resolve(parameters)
         values = values.reshape(*values.shape[:-1], 6, 11)
@@ -58,8 +57,8 @@ class RotaryHexapod(Mechanism):
         level, upright = u - lean_v[..., None] * axis, v + lean_u[..., None] * axis
         place, turn = pose[..., None, :3], pose[..., None, 3:]
         angle = torch.sqrt((turn**2).sum(-1, keepdim=True) + 1e-30)
-        way = (turn / angle).expand(torch.broadcast_shapes(turn.shape, head.shape))
-        head = head.expand(torch.broadcast_shapes(turn.shape, head.shape))
+        shape = torch.broadcast_shapes(turn.shape, head.shape)  # type: ignore[no-untyped-call]
+        way, head = (turn / angle).expand(shape), head.expand(shape)
         along = (way * head).sum(-1, keepdim=True)
         turned = head * torch.cos(angle) + torch.linalg.cross(way, head) * torch.sin(angle)
         turned = turned + way * along * (1 - torch.cos(angle))

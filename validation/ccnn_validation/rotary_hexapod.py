@@ -31,6 +31,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from ccnn_validation.drawn import commanded
 
 Array = NDArray[np.float64]
+Pose = tuple[Array, Array]  # places and frames
 # By the drawing: radii of the joints, crank, rod [m], turns of the motor for one of the crank, mass of platform [kg].
 BASE, PLATFORM, CRANK, ROD, RATIO, MASS, G = 0.40, 0.30, 0.12, 0.45, 50.0, 30.0, 9.81
 PAIR, SIDE = np.radians(120.0 * (np.arange(6) // 2)), np.tile([-1.0, 1.0], 3)
@@ -42,8 +43,8 @@ AXES = np.cross(LEVEL, UP)
 PROBE, HOME, STEEL, ALU = np.array([0.10, 0.05, 0.06]), 0.39, 11.5e-6, 23e-6
 NOISE, TURN_NOISE, NEW = 20e-6, 50e-6, 300
 WEIGHTS = 1 / np.repeat([NOISE, TURN_NOISE], 3)
-CAUSES = ("places axes lengths zeros lost play friction output motor gear "
-          "stiffening stretch load warmth clearance").split()  # fmt: skip
+CAUSES = ["places", "axes", "lengths", "zeros", "lost", "play", "friction", "output", "motor", "gear", "stiffening"]
+CAUSES += ["stretch", "load", "warmth", "clearance"]
 INNER = "{mechanism: rotary_cranks.py:RotaryHexapod, base: true, tool: true, allow_code: true"
 CONFIG = f"mechanism: framed\nmechanism_keys: {INNER}}}\n"
 TOLD = CONFIG.replace("allow_code: true", "allow_code: true, keys: {told: true}")
@@ -127,7 +128,7 @@ class Platform:
             at, frame = at + step[:, :3], turned(step[:, 3:]) @ frame
         return at, frame, ways, slope
 
-    def reached(self, joints: Array, told: Array, scatter: Array | float = 0.0) -> tuple[Array, Array]:
+    def reached(self, joints: Array, told: Array, scatter: Array | float = 0.0) -> Pose:
         """Place and frame of the probe; `told`: temperatures of base and rods, payload [kg], directions, `s x 9`."""
         base, warm, payload, side = told[:, 0] - 20, told[:, 1] - 20, told[:, 2], told[:, 3:]
         waves = self.wave * np.sin(self.rate * joints[:, None] + self.phase)
@@ -141,8 +142,7 @@ class Platform:
             cos, sin = np.cos(angles + wound)[..., None], np.sin(angles + wound)[..., None]
             ends = feet + crank[..., None] * (cos * self.level + sin * self.up)
             at, frame, ways, slope = self.closed(ends, heads, rods + stretched)
-            force = np.array([0, 0, -G])
-            lever = (frame @ self.middle) * MASS
+            force, lever = np.array([0, 0, -G]), (frame @ self.middle) * MASS
             lever = lever + ((frame @ (centre(payload) + self.aside)[..., None])[..., 0]) * payload[:, None]
             wrench = np.concatenate([(MASS + payload)[:, None] * force, np.cross(lever, force)], -1) * self.loaded
             pull = np.linalg.solve(slope.swapaxes(1, 2), wrench[..., None])[..., 0]
@@ -156,7 +156,7 @@ class Platform:
             stretched = pull * self.rod_gives + self.clearance * np.tanh(pull / 15)
         return at + frame @ self.point, frame @ self.probe
 
-    def measured(self, joints: Array, told: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    def measured(self, joints: Array, told: Array, rng: np.random.Generator) -> Pose:
         """As the camera reads it: place `s x 3` [m], frame; cranks and ball joints rest with some scatter."""
         really = told + np.pad(rng.normal(0, 0.1, (len(told), 2)), ((0, 0), (0, 7)))
         scatter = rng.normal(0, 8e-6, joints.shape), rng.normal(0, 1.5e-6, joints.shape)
@@ -165,7 +165,7 @@ class Platform:
         return place, turned(rng.normal(0, TURN_NOISE, place.shape)) @ self.turn @ frame
 
 
-def day(rows: int, rng: np.random.Generator, ends: Array | None = None) -> tuple[Array, ...]:
+def day(rows: int, rng: np.random.Generator, ends: Array | None = None) -> tuple[Array, Pose, Array]:
     """Joints, places and frames by the drawing, and what is told; `ends`: temperatures of those measured, `2 x 2`."""
     at = rng.uniform([-0.04, -0.04, HOME - 0.035], [0.04, 0.04, HOME + 0.035], (rows, 3))
     frame = turned(rng.uniform(-0.09, 0.09, (rows, 3)))
@@ -176,7 +176,7 @@ def day(rows: int, rng: np.random.Generator, ends: Array | None = None) -> tuple
         temperature = rng.uniform(ends[0], ends[1], (rows, 2))
     joints = drawn_joints(at, frame)
     direction = np.sign(np.diff(joints, axis=0, prepend=joints[:1] - 1))
-    return joints, at, frame, np.c_[temperature, 40.0 * rng.integers(0, 5, rows), direction]
+    return joints, (at, frame), np.c_[temperature, 40.0 * rng.integers(0, 5, rows), direction]
 
 
 def missed(at: Array, frame: Array, place: Array, turn: Array) -> Array:
@@ -185,7 +185,7 @@ def missed(at: Array, frame: Array, place: Array, turn: Array) -> Array:
     def off(x: Array) -> Array:
         moved, own = turned(x[:3]), turned(x[6:9])
         far = place @ moved.T + x[3:6] - at - frame @ (PROBE + x[9:])
-        return np.c_[far, Rotation.from_matrix(moved @ turn @ (frame @ own).swapaxes(1, 2)).as_rotvec()]
+        return np.asarray(np.c_[far, Rotation.from_matrix(moved @ turn @ (frame @ own).swapaxes(1, 2)).as_rotvec()])
 
     found = off(least_squares(lambda x: (off(x) * WEIGHTS).ravel(), np.zeros(12), x_scale=1e-3).x)
     sizes = [np.linalg.norm(part, axis=1) for part in (found[:, :3], found[:, 3:])]
@@ -213,7 +213,7 @@ def forces(at: Array, frame: Array, payload: Array) -> tuple[Array, Array, Array
     return moved * pull, pull, np.linalg.inv(slope) * moved[:, None, :]
 
 
-def script(x: Array, pose: tuple[Array, Array], joints: Array, told: Array, held: tuple[Array, Array]) -> Array:
+def script(x: Array, pose: Pose, joints: Array, told: Array, held: tuple[Array, Array]) -> Array:
     """Angles to command for a pose, by the script, `s x 6`; `joints`: about where the cranks are; `held`: forces."""
     at, frame = pose
     feet, heads, lean = FEET + x[:18].reshape(6, 3), HEADS + x[18:36].reshape(6, 3), x[36:48].reshape(2, 6, 1)
@@ -229,14 +229,14 @@ def script(x: Array, pose: tuple[Array, Array], joints: Array, told: Array, held
     return np.asarray(angles - told[:, 3:] * lost / 2 - soft * held[0])
 
 
-def placed(x: Array, place: Array, turn: Array) -> tuple[Array, Array]:
+def placed(x: Array, place: Array, turn: Array) -> Pose:
     """Pose of the platform from that of the probe as the camera reads it; `x`: turn and shift of base and probe."""
     moved, own = turned(x[:3]), turned(x[6:9])
     frame = moved @ turn @ own.T
     return place @ moved.T + x[3:6] - frame @ (PROBE + x[9:12]), frame
 
 
-def script_fit(joints: Array, wanted: tuple[Array, Array], told: Array, seen: tuple[Array, Array], full: bool) -> tuple:
+def script_fit(joints: Array, wanted: Pose, told: Array, seen: Pose, full: bool) -> tuple[Array, Array]:
     """Numbers of the script, and what it leaves of place and turn, `s x 6`."""
     scale = np.r_[SIZES, MORE * float(full), SETUP]
     first = Rotation.from_matrix(wanted[1] @ seen[1].swapaxes(1, 2)).mean()
@@ -250,13 +250,13 @@ def script_fit(joints: Array, wanted: tuple[Array, Array], told: Array, seen: tu
         return np.asarray((moves @ lacks[..., None])[..., 0])
 
     def residuals(u: Array) -> Array:
-        return np.r_[(left(u) * WEIGHTS).ravel(), u * np.r_[np.ones(len(u) - 12), np.full(12, 0.1)]]
+        return np.asarray(np.r_[(left(u) * WEIGHTS).ravel(), u * np.r_[np.ones(len(u) - 12), np.full(12, 0.1)]])
 
     found = least_squares(residuals, np.zeros(len(scale)), method="lm").x
     return (found * scale)[:-12], left(found)
 
 
-def corrected(numbers: Array, pose: tuple[Array, Array], wanted: Array, told: Array) -> Array:
+def corrected(numbers: Array, pose: Pose, wanted: Array, told: Array) -> Array:
     """Angles at which the script's platform is at a pose, `s x 6`."""
     held, joints = forces(*pose, told[:, 2])[:2], wanted.copy()
     for _ in range(4):
@@ -272,7 +272,7 @@ def by_process(joints: Array, told: Array, left: Array, wanted: Array, then: Arr
     return np.stack([make(kernel, normalize_y=True, random_state=0).fit(rows, one).predict(new) for one in left.T], -1)
 
 
-def table(joints: Array, told: Array, loads: Array | None, seen: tuple[Array, Array] | None) -> tuple[str, Array]:
+def table(joints: Array, told: Array, loads: Array | None, seen: Pose | None) -> tuple[str, Array]:
     """Header and rows of a file in degrees, mm and deg C; `loads`: force and moment in the place of the payload."""
     columns = {f"q{k + 1}[deg]": np.degrees(joints[:, k]) for k in range(6)}
     columns |= {"temperature_base[degC]": told[:, 0], "temperature_rods[degC]": told[:, 1]}
@@ -291,13 +291,13 @@ def table(joints: Array, told: Array, loads: Array | None, seen: tuple[Array, Ar
 def judged(seed: int, rows: int, without: tuple[str, ...], names: list[str], kept: Path | None) -> dict[str, Array]:
     """What one machine misses, by who calibrated it; NaN where there were no commands."""
     machine, rng = Platform(seed, without), np.random.default_rng([seed, 1])
-    joints, *posed, told = day(rows, rng)
+    joints, posed, told = day(rows, rng)
     seen = machine.measured(joints, told, rng)
-    wanted, *goal, then = day(NEW, rng, np.stack([told[:, :2].min(0), told[:, :2].max(0)]))
+    wanted, goal, then = day(NEW, rng, np.stack([told[:, :2].min(0), told[:, :2].max(0)]))
     sent = {"as drawn": wanted}
     for full, who in ((False, "plain script"), (True, "fuller script")):
-        numbers, left = script_fit(joints, tuple(posed), told, seen, full)
-        sent[who] = corrected(numbers, tuple(goal), wanted, then)
+        numbers, left = script_fit(joints, posed, told, seen, full)
+        sent[who] = corrected(numbers, goal, wanted, then)
         more = by_process(joints, told, left, wanted, then)
         better = goal[0] - more[:, :3], turned(-more[:, 3:]) @ goal[1]
         sent[f"{who} and process"] = corrected(numbers, better, wanted, then)
