@@ -152,8 +152,10 @@ class Thermal(Effect):
     reference that was not 20 degC (a constant growth); beams that bend by what the surroundings are ahead of the body,
     T - θ; parts of the growth that follow at once, or with a lag of their own (a core in its skin); and the drives' own
     warmth, which no thermometer in the hall sees: growth of all and of the sliding drives by 1 - exp(-t / 2000 s). By
-    each further thermometer, `temperature_NAME`, growth of all these parts by what it shows beyond the first one, each
-    there or not for itself: a leg grows by its own thermometer. Without `temperature` the mean of these stands for it.
+    each further thermometer, `temperature_NAME`, growth of all these parts by what it shows beyond the first one, and
+    of drives and mounts by what it shows itself, each there or not for itself: a leg, or a screw, grows by its own
+    thermometer. Lengths that every leg has one of may grow together, as a base plate does. Without `temperature` the
+    mean of the others stands for it.
 
     Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
     derivatives, so the effect is one on the pose: no joint has to replace a length (near a singularity of an arm
@@ -203,7 +205,7 @@ class Thermal(Effect):
                 for j in mechanism.joints
                 if j.unit == "m"
             ]
-        following = [c for c in found[: 1 + len(_apart(mechanism))]]
+        following = found[: 1 + len(_apart(mechanism))]
         bodies = [Coefficient(p.name, "1/K", _STEEL, secondary=True, part=p.name) for p in like_parts(mechanism)]
         drives = [c for c in found if c.name.endswith((" travel", " mount"))]
         found += bodies
