@@ -113,3 +113,17 @@ def test_a_larger_model_has_to_be_better_by_two_standard_errors(left: tuple[floa
     before = torch.tensor([1.0, 1.0, 1.0, 1.0, 1e3], dtype=torch.float64)
     found = simplest_of_best({simple: before, larger: before * torch.tensor(left)}, "")
     assert found.identify and (found.method == "gp") is learner
+
+
+def test_the_least_safe_model_has_to_beat_all_that_are_simpler() -> None:
+    """A learner on the nominal machine beat the effects, but not what is learned beside them: it was taken all the same."""
+    geometry, effects = Candidate(True, False, False), Candidate(True, True, False)
+    both, nominal = Candidate(True, True, True), Candidate(False, False, True)
+    errors = {
+        geometry: torch.full((5,), 149.0),
+        effects: torch.tensor([41.0, 42.0, 42.0, 41.0, 43.0]),
+        both: torch.tensor([20.0, 42.0, 33.0, 45.0, 28.0]),
+        nominal: torch.tensor([32.0, 33.0, 32.5, 32.0, 33.5]),
+    }
+    found = simplest_of_best(errors, "")
+    assert found.identify and found.effects and found.method == "gp"

@@ -209,6 +209,44 @@ def test_one_link_grows_by_its_own_thermometer_and_no_other_does(first: str) -> 
     assert "growth" in own and {n.rpartition(" ")[0] for n in own if n.endswith(ends)} == {"link 3"}
 
 
+@pytest.mark.parametrize("away", [0.0, 1.0])
+def test_a_screw_grows_by_its_own_thermometer_where_many_are_told(away: float) -> None:
+    """Seven thermometers of which one says something: the idle ones are no evidence against it. It is away from 20
+    degrees at first, so that its own warmth and that beside the hall's are two things."""
+    mechanism, drawn = load_mechanism("stewart"), torch.Generator().manual_seed(8)
+    joints = mechanism.solve_inverse(mechanism.sample_workspace(80, drawn))
+    names = ["temperature", *(f"temperature_q{i + 1}" for i in range(6))]
+    warm = 293.15 + 5 * away + 4 * torch.rand(80, 7, generator=drawn, dtype=torch.float64)
+    told = dict(zip(names, warm.unbind(-1), strict=True))
+    situation = Situation(mechanism, joints, told, default_gravity(mechanism))
+    effect = make_effect("thermal")
+    own = [c.name for c in effect.coefficients(situation)]
+    grown = torch.tensor([1.15e-5 * (name == "q3 travel q3") for name in own], dtype=torch.float64)
+    pose = reached(situation, [Acting(effect, torch.zeros(0, dtype=torch.float64), grown)])
+    pose = pose + NOISE / 4 * torch.randn(pose.shape, generator=drawn, dtype=torch.float64)
+    (found,) = effects_that_pay(situation, pose, [effect], torch.ones(80) > 0, [])
+    parts = {own[k] for k in found.used if effect.coefficients(situation)[k].part}
+    assert "q3 travel q3" in parts and len(parts) < 4
+
+
+def test_a_base_plate_grows_as_one_body() -> None:
+    """The places of all joints on it, which no leg shows enough by itself."""
+    mechanism, drawn = load_mechanism("stewart"), torch.Generator().manual_seed(9)
+    joints = mechanism.solve_inverse(mechanism.sample_workspace(80, drawn))
+    warm = 293.15 + 4 * torch.rand(80, generator=drawn, dtype=torch.float64)
+    situation = Situation(mechanism, joints, {"temperature": warm}, default_gravity(mechanism))
+    effect = make_effect("thermal")
+    own = [c.name for c in effect.coefficients(situation)]
+    plates = {c.name for c in effect.coefficients(situation) if c.part}
+    assert len(plates) == 2
+    plate = sorted(plates)[0]
+    grown = torch.tensor([2.3e-5 * (name == plate) for name in own], dtype=torch.float64)
+    pose = reached(situation, [Acting(effect, torch.zeros(0, dtype=torch.float64), grown)])
+    pose = pose + NOISE * torch.randn(pose.shape, generator=drawn, dtype=torch.float64)
+    (found,) = effects_that_pay(situation, pose, [effect], torch.ones(80) > 0, [])
+    assert plate in {own[k] for k in found.used}
+
+
 @pytest.mark.parametrize("wave", [3.5, 0.9, None])
 def test_how_smooth_a_rail_is_is_asked_of_the_rows(wave: float | None) -> None:
     """A track of 4 m on rails with waves, long or short, or on straight ones."""

@@ -95,7 +95,7 @@ def choose_model(
 
     By cross-validation in the training rows of one repeat, at most 600 of them; frames, parameters, coefficients and
     learner are fitted anew in each fold. The learner is a Gaussian process, for every method that is trained later. A
-    simpler candidate is kept unless a later one is better by more than a standard error of the folds' differences.
+    simpler candidate is kept unless another is better by more than two standard errors of the folds' differences.
 
     Args:
         split: of the repeat.
@@ -229,18 +229,18 @@ def _learned(
 
 
 def simplest_of_best(errors: dict[Candidate, Tensor], asked: str) -> ModelChoice:
-    """The simplest that none of the later ones beats by more than two standard errors over the folds.
+    """The simplest that none of the others beats by more than two standard errors over the folds.
 
     Args:
         errors: mean squared pose error by fold, `k` [m²], by candidate, the simplest first.
         asked: what was asked for, a sentence or nothing.
     """
-    chosen, *others = errors
-    for other in others:
-        # By ratio: a fold with a row near a singular pose errs many times as much as the others in both.
-        gain = torch.log(errors[chosen] / errors[other])
-        if float(gain.mean()) > _ERRORS * float(gain.std()) / math.sqrt(len(gain)):
-            chosen = other
+    # By ratio: a fold with a row near a singular pose errs many times as much as the others in all.
+    logs = torch.stack([e.log() for e in errors.values()])
+    worse = logs[:, None] - logs
+    is_beaten = (worse.mean(-1) > _ERRORS * worse.std(-1) / math.sqrt(logs.shape[-1])).any(-1).tolist()
+    # Two may beat each other by no more than rounding, but never all.
+    chosen = next((c for c, beaten in zip(errors, is_beaten, strict=True) if not beaten), next(iter(errors)))
     said = ", ".join(f"{c.words} {1e3 * math.sqrt(float(e.mean())):.3g} mm" for c, e in errors.items())
     why = f"{chosen.words.capitalize()}: the simplest of the best in cross-validation (held-out RMS: {said})."
     method = _LEARNER if chosen.learner else "constant"

@@ -62,7 +62,8 @@ def like_parts(mechanism: Mechanism) -> list[Member]:
             name = f"all {whole.rstrip('xyz') or whole}"
             found.setdefault(name, Member(name, [], None, None)).lengths.append(k)
             legs.setdefault(name, set()).add(parameter.leg)
-    return [part for part in found.values() if len(legs[part.name]) > 1]
+    # What has no length grows by nothing.
+    return [p for p in found.values() if len(legs[p.name]) > 1 and any(inner.geometry[k].nominal for k in p.lengths)]
 
 
 def _weights(arm: SerialArm, joints: Tensor, values: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:

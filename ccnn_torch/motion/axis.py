@@ -5,11 +5,12 @@ The motor's torque is the gain times (command less position). With everything di
     inertia * q'' = clip(gain * supply * (u - q + integral * I + derivative * (u' - q')), (1 - fading * q') / weakness)
                     - viscous * q' - F(q') * sign(q') - weight(q) - teeth(q)
 
-where u is the command after delay, speed limit, gear ratio and offset, and I the integral of u - q over the time:
+where u is the command after delay, speed limit, gear ratio and offset, u' the share `forward` of its speed, late by
+`forward_lag`, and I the integral of u - q over the time, in a cascade of u - q + derivative * (u' - q'):
 torques are then angles (N m per N m/rad), the inertia is in s^2, the viscous friction in s; a part of that which the
 drive makes is within the limit, too. Within a dead band u - q counts as 0. With all of these 0 the position follows
 the command exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and weight hang on a
-spring that pulls at the motor.
+spring that pulls at the motor. Play, and the uneven transmission of a gear or screw, come behind all that.
 """
 
 from __future__ import annotations

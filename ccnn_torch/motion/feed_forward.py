@@ -2,8 +2,9 @@
 
 u <- u + the smoothed (wanted - simulated position), divided by what a pulse of the command makes of the position:
 iterative learning control (Arimoto 1984; Norrlöf and Gunnarsson 2002) with the simulator in the place of the machine.
-Of some shares of a step the best is taken, and none that takes a command farther from the wanted position, or out of
-the range of the motion, than a bound. Before the motion the machine stands where it begins.
+Beside that stands the error itself, undivided. Of some shares of both steps the best is taken, and none that takes a
+command farther from the wanted position, or out of the range of the motion, than a bound. Before the motion the machine
+stands where it begins.
 """
 
 from __future__ import annotations
