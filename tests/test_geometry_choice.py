@@ -116,7 +116,7 @@ def test_a_larger_model_has_to_be_better_by_two_standard_errors(left: tuple[floa
 
 
 def test_the_least_safe_model_has_to_beat_all_that_are_simpler() -> None:
-    """A learner on the nominal machine beat the effects, but not what is learned beside them: it was taken all the same."""
+    """A learner on the nominal machine beat the effects, but not what is learned beside them, and was taken."""
     geometry, effects = Candidate(True, False, False), Candidate(True, True, False)
     both, nominal = Candidate(True, True, True), Candidate(False, False, True)
     errors = {
