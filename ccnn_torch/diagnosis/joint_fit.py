@@ -429,7 +429,7 @@ def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
         # An effect costs its place in the library; what is secondary in one that is there is as likely there as not.
         worth = torch.tensor([0.0 if part else EFFECT for _, part in names])
         gain = _gained_without(fit_sets(grams, [[*groups.values()]], 0.0), groups, removed) - worth
-        order = gain.argsort(descending=True).tolist()
+        order, fitted = gain.argsort(descending=True).tolist(), list[int]()
         # Those that gain most with the scales as they are, and all before none is said to.
         for some in (order[:_TRIED], order[_TRIED:]):
             sets = [[g for label, g in groups.items() if label not in removed[k]] for k in some]
@@ -437,13 +437,14 @@ def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
             gain[some] = evidence[1:] - evidence[0] - worth[some]
             # An effect stays until its idle parts are gone, whose number is no evidence against what is left of it.
             idle = {name for (name, part), g in zip(names, gain.tolist(), strict=True) if part and g >= 0}
-            some = [k for k in some if names[k][1] or names[k][0] not in idle]
-            best = max(some, key=lambda k: float(gain[k]), default=-1)
-            if best >= 0 and float(gain[best]) >= 0:
+            fitted += some
+            able = [k for k in fitted if gain[k] >= 0 and (names[k][1] or names[k][0] not in idle)]
+            if able:
                 break
         else:
             break
-        groups = {label: g for label, g in groups.items() if label not in removed[best]}
+        gone = removed[max(able, key=lambda k: float(gain[k]))]
+        groups = {label: g for label, g in groups.items() if label not in gone}
     kept = torch.zeros(rows.model.size, dtype=torch.bool)
     for group in groups.values():
         kept[group] = True
