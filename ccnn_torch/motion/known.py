@@ -10,15 +10,7 @@ from ccnn_torch.units import amount
 
 TIME, _WEIGHT = "time", ("gravity_sin", "gravity_cos")
 _SAME = (
-    "gain",
-    "integral",
-    "derivative",
-    "forward",
-    "inertia",
-    "viscous",
-    "coulomb",
-    "load_friction",
-    "stribeck",
+    *("gain", "integral", "derivative", "forward", "inertia", "viscous", "coulomb", "load_friction", "stribeck"),
     "delay",
 )
 OF: dict[str, tuple[str, ...]] = {name: (name,) for name in _SAME} | {"mass": _WEIGHT, "torque_limit": ("weakness",)}

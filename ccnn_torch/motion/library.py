@@ -70,7 +70,6 @@ class Library(NamedTuple):
 
     Attributes:
         effects: that are tried.
-        names: of these.
         facts: of each axis.
         numbers: of each axis, those of every effect one after the other; shapes that are held have none.
         size: `k`.
@@ -87,7 +86,6 @@ class Library(NamedTuple):
     """
 
     effects: tuple[MotionEffect, ...]
-    names: tuple[str, ...]
     facts: tuple[Facts, ...]
     numbers: tuple[tuple[Number, ...], ...]
     size: int
@@ -100,6 +98,11 @@ class Library(NamedTuple):
     twins: Mapping[int, int]
     changes: tuple[tuple[int, str, str, Tensor], ...]
     about: Mapping[str, float] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the effects."""
+        return tuple(effect.name for effect in self.effects)
 
     @property
     def bounds(self) -> tuple[Tensor, Tensor]:
@@ -269,7 +272,6 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
     }
     return Library(
         tuple(effects),
-        tuple(effect.name for effect in effects),
         tuple(facts),
         tuple(map(tuple, numbers)),
         len(numbers[0]) + len(held),

@@ -91,7 +91,8 @@ def search(problem: Problem) -> Search:
     plain.backward()
     plain.forward()
     largest = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
-    problem, few, fewest = (_repeating(one, problem, largest) for one in (problem, few, fewest))
+    library = _repeating(problem, largest)
+    problem, few, fewest = (replace(one, library=library) for one in (problem, few, fewest))
     pool = _Pool(fewest, fitted_whitening(problem.pooled(largest), problem.judged))
     pool.again(plain)
     pool.forward()
@@ -115,11 +116,20 @@ def search(problem: Problem) -> Search:
     )
 
 
-def _repeating(problem: Problem, whole: Problem, left: Tensor) -> Problem:
-    """The problem, some of the whole one, with waves as they repeat in what a model leaves of that, `n x b x s`."""
-    data = whole.data
+def _repeating(problem: Problem, left: Tensor) -> Library:
+    """The library with waves as they repeat in what a model leaves, `n x b x s`."""
+    data = problem.data
     each = zip(*(v[:, data.judged] for v in (left, data.position, data.speed)), strict=True)
-    return replace(problem, library=problem.library.repeating([left_ripples(*own) for own in each]))
+    return problem.library.repeating([left_ripples(*own) for own in each])
+
+
+def _best_variants(found: Sequence[tuple[float, Variant]]) -> dict[int, tuple[float, Variant]]:
+    """Of each effect the variant that promises most, with what it does."""
+    best: dict[int, tuple[float, Variant]] = {}
+    for score, variant in found:
+        if variant.effect not in best or _level(score) > _level(best[variant.effect][0]):
+            best[variant.effect] = (score, variant)
+    return best
 
 
 def _level(score: float) -> float:
@@ -233,18 +243,14 @@ class _Pool:
     def backward(self) -> None:
         """From the most probable set with all beside it that a loop may have wrong, less and less, as long as that
         brings evidence: where two of these are nothing without each other, one after the other finds neither."""
-        now = []
+        begin = [(i, f.spec) for i, f in enumerate(self.best())]
         variances = [self.noise_of(i) for i in range(self.axes)]
-        pairs = [(i, f.spec) for i, f in enumerate(self.best())]
-        for (i, spec), found in zip(
-            pairs, promises(self.problem, self.whitening, pairs, self.nuisance, variances), strict=True
-        ):
-            first: dict[int, tuple[float, Variant]] = {}
-            for score, variant in found:
-                if self.library.names[variant.effect] in _COMMON and score > first.get(variant.effect, (-math.inf,))[0]:
-                    first[variant.effect] = score, variant
-            for _, variant in first.values():
-                spec = started(spec, variant, i)
+        now = []
+        promised = promises(self.problem, self.whitening, begin, self.nuisance, variances)
+        for (i, spec), found in zip(begin, promised, strict=True):
+            for _, variant in _best_variants(found).values():
+                if self.library.names[variant.effect] in _COMMON:
+                    spec = started(spec, variant, i)
             now.append(spec)
         self.fit([[s] for s in now], _LONG)
         fits, going = [self.found[i][s.members] for i, s in enumerate(now)], [True] * self.axes
@@ -253,9 +259,7 @@ class _Pool:
                 [f.spec if on else nothing(self.library) for f, on in zip(fits, going, strict=True)], _SHORT
             )
             best = [max(own, key=log_posterior, default=f) for own, f in zip(less, fits, strict=True)]
-            going = [
-                len(f.members) > 1 and log_posterior(b) > log_posterior(f) for b, f in zip(best, fits, strict=True)
-            ]
+            going = [_level(log_posterior(b)) > _level(log_posterior(f)) for b, f in zip(best, fits, strict=True)]
             fits = [b if on else f for b, f, on in zip(best, fits, going, strict=True)]
 
     def explored(self) -> list[list[Spec]]:
@@ -352,11 +356,10 @@ class _Pool:
                 # Alone an effect is tried from wherever it may begin: limits are far from linear.
                 more = [started(fit.spec, v, i) for _, v in found if len(self.library.variants[v.effect]) <= _STARTS]
                 wanted[i] |= {(*spec.members, k): spec for k, spec in enumerate(more)}
-            scores: dict[int, tuple[float, Variant]] = {}
-            for score, variant in found:
-                if variant.effect not in scores or _level(score) > _level(scores[variant.effect][0]):
-                    scores[variant.effect] = (score, variant)
-            ranked = (v for _, v in sorted(scores.values(), key=lambda item: (-_level(item[0]), item[1].effect)))
+            ranked = (
+                v
+                for _, v in sorted(_best_variants(found).values(), key=lambda item: (-_level(item[0]), item[1].effect))
+            )
             specs = (started(fit.spec, variant, i) for variant in ranked)
             new = (spec for spec in specs if spec.members not in old[i])
             for spec in islice(new, most):
