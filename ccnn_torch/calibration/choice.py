@@ -239,8 +239,8 @@ def simplest_of_best(errors: dict[Candidate, Tensor], asked: str) -> ModelChoice
     logs = torch.stack([e.log() for e in errors.values()])
     worse = logs[:, None] - logs
     is_beaten = (worse.mean(-1) > _ERRORS * worse.std(-1) / math.sqrt(logs.shape[-1])).any(-1).tolist()
-    # Two may beat each other by no more than rounding, but never all.
-    chosen = next((c for c, beaten in zip(errors, is_beaten, strict=True) if not beaten), next(iter(errors)))
+    # The one with the least mean is beaten by none.
+    chosen = next(c for c, beaten in zip(errors, is_beaten, strict=True) if not beaten)
     said = ", ".join(f"{c.words} {1e3 * math.sqrt(float(e.mean())):.3g} mm" for c, e in errors.items())
     why = f"{chosen.words.capitalize()}: the simplest of the best in cross-validation (held-out RMS: {said})."
     method = _LEARNER if chosen.learner else "constant"

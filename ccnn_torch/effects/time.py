@@ -178,15 +178,17 @@ class Thermal(Effect):
         found = [Coefficient("growth", "1/K", _STEEL, positive=True)]
         uneven = _STEEL * _UNEVEN
         found += [Coefficient(m.name, "1/K", uneven, joint=m.joint, leg=m.leg) for m in _apart(mechanism)]
-        found += [
+        following = [*found]
+        drives = [
             Coefficient(f"{j.name} travel", "1/K", _STEEL, joint=j.name, positive=True)
             for j in mechanism.joints
             if j.unit == "m"
         ]
-        found += [
+        drives += [
             Coefficient(f"{j.name} mount", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
             for j in mechanism.joints
         ]
+        found += drives
         found.append(Coefficient("reference", "1", _STEEL * _REFERENCE_OFF, secondary=True))
         if "time" in situation.covariates:
             own = _STEEL * _OWN_WARMTH
@@ -205,17 +207,14 @@ class Thermal(Effect):
                 for j in mechanism.joints
                 if j.unit == "m"
             ]
-        following = found[: 1 + len(_apart(mechanism))]
         bodies = [Coefficient(p.name, "1/K", _STEEL, secondary=True, part=p.name) for p in like_parts(mechanism)]
-        drives = [c for c in found if c.name.endswith((" travel", " mount"))]
         found += bodies
-        following = [*following, *bodies, *drives]
         found += [
             replace(
                 c, name=f"{c.name} {name.partition('_')[2]}", secondary=True, positive=False, part=f"{name} {c.name}"
             )
             for name in situation.thermometers
-            for c in following
+            for c in (*following, *bodies, *drives)
         ]
         return tuple(found)
 
@@ -262,18 +261,17 @@ class Thermal(Effect):
         n, sliding = len(mechanism.joints), sum(j.unit == "m" for j in mechanism.joints)
         following, one = 1 + len(_apart(mechanism)) + sliding, torch.ones_like(warm)
         bodies = len(like_parts(mechanism))
-        if not _timed(situation):
-            kinds = [(warm, following + n), (one, 1), (warm, bodies)]
-        else:
+        body, kinds = warm, [(one, 1)]
+        if _timed(situation):
             time = situation.covariates["time"]
             body, core = (lagged(time, warm, shape[..., k]) for k in (0, 1))
             own = -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
-            kinds = [(body, following + n), (one, 1), (warm, 1), (core, 1), (warm - body, n), (own, following)]
-            kinds.append((body, bodies))
+            kinds += [(warm, 1), (core, 1), (warm - body, n), (own, following)]
             others = [lagged(time, other, shape[..., 0]) for other in others]
+        kinds = [(body, following + n), *kinds, (body, bodies)]
         for other in others:
             # A screw is as warm as its own thermometer; what a leg's shows is beside the growth of the whole machine.
-            kinds += [(other - kinds[0][0], following - sliding + bodies), (other, sliding + n)]
+            kinds += [(other - body, following - sliding + bodies), (other, sliding + n)]
         each = torch.stack(torch.broadcast_tensors(*(k for k, _ in kinds)), -1)  # type: ignore[no-untyped-call]
         return each[..., [i for i, (_, count) in enumerate(kinds) for _ in range(count)]]
 
