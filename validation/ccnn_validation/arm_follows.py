@@ -19,12 +19,9 @@ joints [mrad] and of the tool [mm] in each motion.
 
 from __future__ import annotations  # noqa: I001
 
-import argparse
-import json
 import sys
 import time as clock
 from pathlib import Path
-from tempfile import mkdtemp
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +33,7 @@ from ccnn_validation.arm_sheet import BALANCE, BASE, C2, C3, DELAY, DRY, FORWARD
 from ccnn_validation.arm_sheet import M3, MOTOR, PLACE, REACH, STIFF, WET, keys, mjcf
 from ccnn_validation.arm_simulator import NAMES, SIZES, START, driven
 from ccnn_validation.delivered.product import Contestant
+from ccnn_validation.drawn import judge_motions
 
 Array = NDArray[np.float64]
 # Steps of the log, the controller and the truth [s]; samples of a run; of those judged, what is left out at both ends.
@@ -328,21 +326,7 @@ def judged(seed: int, without: str, folder: Path, names: list[str]) -> dict[str,
 
 def main() -> None:
     """Judge arms and print what each contestant's joints and tool are off the wanted motion."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--seed", type=int, required=True)
-    options.add_argument("--machines", type=int, default=1)
-    options.add_argument("--without", choices=("", *CAUSES), default="", help="a cause that is switched off")
-    options.add_argument("--keep", type=Path, help="folder of the files; by default a temporary one")
-    options.add_argument("--ours", default="bare,keys,mjcf,simulator")
-    given = options.parse_args()
-    folder = (given.keep or Path(mkdtemp())).resolve()
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(given.seed, given.seed + given.machines):
-        found = judged(seed, given.without, folder, [name for name in given.ours.split(",") if name])
-        for who, kinds in found.items():
-            told = (f"{kind} {a:.2f} / {b:.2f} mrad {x:.2f} / {y:.2f} mm" for kind, (a, b, x, y) in kinds.items())
-            print(f"  {who}: " + "   ".join(told), flush=True)
-        (folder / f"{seed}{given.without}.json").write_text(json.dumps(found, indent=1))
+    judge_motions(__doc__, judged, CAUSES, "bare,keys,mjcf,simulator", "{:.2f} / {:.2f} mrad {:.2f} / {:.2f} mm")
 
 
 if __name__ == "__main__":

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import mkdtemp
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 from ccnn_validation.delivered.product import Contestant
 from ccnn_validation.delivered.tables import read_commands
 
-__all__ = ["commanded", "judge_machines"]
+__all__ = ["commanded", "judge_machines", "judge_motions"]
 
 Array = NDArray[np.float64]
 
@@ -48,6 +50,42 @@ def commanded(
     contestant.call("compensate", f"{command}/{model}", "targets.csv", f"{command}.csv", *flags.split())
     path, joints = folder / f"{command}.csv", sum(column.startswith("q") for column in targets[0].split(","))
     return read_commands(path, joints).joints if path.is_file() else None
+
+
+Motions = dict[str, dict[str, list[float]]]
+"""What is missed, four numbers, by contestant and new motion."""
+
+
+def judge_motions(
+    about: str | None,
+    judged: Callable[[int, str, Path, list[str]], Motions],
+    causes: Sequence[str],
+    ours: str,
+    form: str,
+) -> None:
+    """Judge machines in motion, the seeds counted from `--seed`, and print what each contestant misses.
+
+    Args:
+        about: of the program.
+        judged: seed, cause that is switched off, folder, and contestants of ours, to what is missed.
+        causes: that can be switched off.
+        ours: contestants of ours where none are asked for, between commas.
+        form: of the four numbers of a motion.
+    """
+    options = argparse.ArgumentParser(description=about)
+    options.add_argument("--seed", type=int, required=True)
+    options.add_argument("--machines", type=int, default=1)
+    options.add_argument("--without", choices=("", *causes), default="", help="a cause that is switched off")
+    options.add_argument("--keep", type=Path, help="folder of the files; by default a temporary one")
+    options.add_argument("--ours", default=ours)
+    given = options.parse_args()
+    folder = (given.keep or Path(mkdtemp())).resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in range(given.seed, given.seed + given.machines):
+        found = judged(seed, given.without, folder, [name for name in given.ours.split(",") if name])
+        for who, kinds in found.items():
+            print(f"  {who}: " + "   ".join(f"{kind} {form.format(*four)}" for kind, four in kinds.items()), flush=True)
+        (folder / f"{seed}{given.without}.json").write_text(json.dumps(found, indent=1))
 
 
 def judge_machines(about: str | None, judged: Callable[[int, int], dict[str, float]], rows: int) -> None:

@@ -1,6 +1,6 @@
 """A stage of two ball screws: does the table follow better where the corrected commands are sent?
 
-`python -m ccnn_validation.servo_follows --seed N [--stages N] [--without CAUSE] [--keep FOLDER] [--ours NAMES]`. Each
+`python -m ccnn_validation.servo_follows --seed N [--machines N] [--without CAUSE] [--keep FOLDER] [--ours NAMES]`. Each
 axis has a cascade of its own (position gain, feedforward of speed, speed by PI) on the motor's encoder, at 20 kHz; a
 linear scale reads the table at 1 kHz. True causes, drawn for each axis: another mass, a feedforward that is less than
 set and late, stick-slip of the guides, a soft screw, play in the nut, one or two samples of delay, a lead that grows,
@@ -10,19 +10,16 @@ runs that are sent once: S-curves to other places at other speeds, a sweep of si
 All know the data sheet: gains, feedforward, masses, friction, lead. "shifted" sends the commands earlier by the mean
 lag. "regression" is what the command is beyond the measured motion, as a linear function of that. "plain script" fits
 a simulated cascade by least squares and iterates its error away. Ours: `ccnn diagnose --motion`, `ccnn compensate` with
-the mechanism servo without keys ("ours, bare"), with those of the data sheet ("ours, keys"; "set" also says that the
-gains, which are set, are exact), and with simulators in Python ("linear cascade", and "cascade" with dry friction and
-delays). Told: RMS / peak in the plane of each run [µm], and the RMS of x and y.
+the mechanism servo without keys ("ours, bare"), with those of the data sheet ("ours, keys"), and with simulators in
+Python ("linear cascade", and "cascade" with dry friction and delays). Told: RMS / peak in the plane of each run [µm],
+and the RMS of x and y.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time as clock
 from pathlib import Path
-from tempfile import mkdtemp
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +27,7 @@ from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.optimize import least_squares
 
 from ccnn_validation.delivered.product import Contestant
+from ccnn_validation.drawn import judge_motions
 
 Array = NDArray[np.float64]
 # Step of the log, of the truth [s]; samples of a run; of those judged, what is left out at both ends.
@@ -340,7 +338,7 @@ def ours(folder: Path, name: str, runs: list[Array], seen: list[Array], new: lis
     np.savetxt(folder / "motion.csv", many, "%.8g", ",", header=f"run[1],time[s],{motion}", comments="")
     (folder / "stage.py").write_text(SIMULATOR)
     contestant = Contestant(folder, "diagnose")
-    choices = {"bare": ["servo"], "keys": ["servo", KEYS], "set": ["servo", KEYS, "exact=[gain, derivative, integral]"]}
+    choices = {"bare": ["servo"], "keys": ["servo", KEYS]}
     options = (choices | {"linear cascade": ["stage.py:STAGE"], "cascade": ["stage.py:CASCADE"]})[name]
     options = ["--mechanism", options[0], "--out", "found", *options[1:]]
     start = clock.time()
@@ -390,21 +388,7 @@ def judged(seed: int, without: str, folder: Path, names: list[str]) -> dict[str,
 
 def main() -> None:
     """Judge stages and print what each contestant's table is off the wanted motion."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--seed", type=int, required=True)
-    options.add_argument("--stages", type=int, default=1)
-    options.add_argument("--without", choices=("", *CAUSES), default="", help="a cause that is switched off")
-    options.add_argument("--keep", type=Path, help="folder of the files; by default a temporary one")
-    options.add_argument("--ours", default="bare,keys,set,linear cascade,cascade")
-    given = options.parse_args()
-    folder = given.keep or Path(mkdtemp())
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(given.seed, given.seed + given.stages):
-        found = judged(seed, given.without, folder, [name for name in given.ours.split(",") if name])
-        for who, kinds in found.items():
-            told = (f"{kind} {a:.2f} / {b:.2f} ({x:.2f}, {y:.2f})" for kind, (a, b, x, y) in kinds.items())
-            print(f"  {who}: " + "   ".join(told))
-        (folder / f"{seed}{given.without}.json").write_text(json.dumps(found, indent=1))
+    judge_motions(__doc__, judged, CAUSES, "bare,keys,linear cascade,cascade", "{:.2f} / {:.2f} ({:.2f}, {:.2f})")
 
 
 if __name__ == "__main__":
