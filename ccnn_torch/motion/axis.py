@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,8 @@ from ccnn_torch.motion.stretches import PLACES, START
 Array = NDArray[np.float64]
 # Steps longer than this, in units of the axis' own time constant, are divided.
 _LONGEST, _MOST_PARTS = 0.15, 8
+# Samples of axes for which another thread begins to pay.
+_SAMPLES = 5000
 
 
 class Drive(NamedTuple):
@@ -107,7 +110,17 @@ def simulate_axes(
     )
     time, command = (np.ascontiguousarray(one.numpy()) for one in (drive.time, drive.command))
     if is_compiled() if fast is None else fast:
-        together = courses(given, has, own, run, time, command, start, bent, push, supply, warm, parts)
+        # Axes know nothing of each other, and the compiled loop lets other threads run.
+        lots = np.array_split(np.arange(len(run)), min(torch.get_num_threads(), 1 + len(run) * s // _SAMPLES))
+
+        def moved(lot: NDArray[np.int64]) -> Array:
+            found: Array = courses(
+                given, has, own[lot], run[lot], time, command, start, bent, push, supply, warm, parts[lot]
+            )
+            return found
+
+        with ThreadPoolExecutor(len(lots)) as threads:
+            together = np.concatenate([*(map if len(lots) == 1 else threads.map)(moved, lots)])
         return torch.from_numpy(together).reshape(*runs.shape, s)
     row = run % len(time)
     delayed = zip(row, run, a.delay[own], strict=True)

@@ -327,15 +327,14 @@ def _stage(axis: Axis, has: Given, fixed: _Fixed, state: State, u: Array, push: 
     if has.dead_band:
         # Within it nothing resists; an axis without a mass goes on as if something did.
         stiff = pick((np.abs(u - q) < axis.own.dead_band) & (fixed.mass > 0), 0.0 * stiff, stiff)
-    # What the gear carries beside the motor's torque.
-    carried = _pulling(axis, has, q, push)
+    # What the gear carries beside the motor's torque: the weight of what hangs on a spring is that of the far side.
+    carried = _pulling(axis, has, pick(axis.hung > 0, x, q) if has.flexibility else q, push)
     against, loose = carried, q
     if has.flexibility:
-        apart, pulled = q - x, _pulling(axis, has, x, push)
+        apart = q - x
         # The load's speed at the end of the stage is this and `follows` times the motor's.
-        loose = (fixed.over * w + apart - axis.slack * pulled) / (fixed.over + fixed.drag)
-        carried = pick(axis.hung > 0, pulled, carried)
-        against = pick(axis.hung > 0, axis.stiffness * (apart - fixed.drag * loose), against)
+        loose = (fixed.over * w + apart - axis.slack * carried) / (fixed.over + fixed.drag)
+        against = pick(axis.hung > 0, axis.stiffness * (apart - fixed.drag * loose), carried)
     free = fixed.mass * v - against
     light = fixed.light
     if has.cogging_sin or has.cogging_cos:

@@ -199,6 +199,17 @@ def test_an_axis_moves_the_same_beside_any_other() -> None:
         assert np.array_equal(lot([one], command(0, TIME))[0], row), one
 
 
+def test_threads_change_no_digit() -> None:
+    sets, threads, ways = [OWN | {"coulomb": 0.01 * k} for k in range(40)], torch.get_num_threads(), []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            ways.append(lot(sets, command(0, TIME)))
+    finally:
+        torch.set_num_threads(threads)
+    assert np.array_equal(*ways)
+
+
 def test_compiled_or_not_an_axis_moves_the_same() -> None:
     time = torch.from_numpy(TIME).expand(2, -1)
     asked = torch.stack([torch.from_numpy(command(k, TIME)) for k in (0, 1)])
