@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -173,15 +173,27 @@ class Problem:
             torque = mass[:, None, None] * self.driven.carried[axis]
             changed["torque"] = torque if self.driven.torque is None else torque + self.driven.torque[axis]
         if own and self.driven.own:
-            # What an axis does to a simulator's positions it does to what its own parameters change of them.
-            shifts = [own[name][:, None, None] * makes[axis] for name, makes in self.driven.own.items() if name in own]
-            changed["command"] = self.driven.followed[axis] + sum(shifts)
+            changed["command"] = self._followed(torch.stack([own[name] for name in own], -1), [*own], axis)
         if changed:
-            # Each model has runs of its own then.
-            at = {name: v[which.flatten() % len(v)] for name, v in drive._asdict().items() if v is not None}
-            drive = drive._replace(**at | {name: v.flatten(0, 1) for name, v in changed.items()})
+            # Each model has runs of its own then; what all axes share is repeated for them.
+            shared = ("time", "supply", "warm", "bent", "usual")
+            each = {n: v[which.flatten()] for n, v in drive._asdict().items() if v is not None and n not in shared}
+            drive = drive._replace(**each | {name: v.flatten(0, 1) for name, v in changed.items()})
             which = torch.arange(which.numel()).reshape(which.shape)
         return simulate_axes(drive, {name: value[:, None] for name, value in parameters.items()}, rows=which)
+
+    def _followed(self, own: Tensor, names: Sequence[str], axis: Tensor) -> Tensor:
+        """What axes are commanded by as a simulator's own parameters are moved, `p x k` of these names; `p x b x s`.
+
+        What an axis does to a simulator's positions it does to what these change of them.
+        """
+        found = self.driven.followed.new_empty(len(axis), *self.driven.followed.shape[1:])
+        makes = torch.stack([self.driven.own[name] for name in names], 1).flatten(2)
+        for i in set(axis.tolist()):
+            here = axis == i
+            moved = self.driven.followed[i].flatten() + own[here] @ makes[i]
+            found[here] = moved.reshape(-1, *found.shape[1:])
+        return found
 
     def residual(self, theta: Tensor, axis: Tensor) -> Tensor:
         """Measured less simulated, as `positions`; finite."""
