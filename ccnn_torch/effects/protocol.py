@@ -61,6 +61,7 @@ class Shape:
         alike: shapes with one such text, and one grid, are of parts that are made alike, and likely have one value;
             empty = it is like no other.
         told: the value that the machine's file tells, or None.
+        moments: of a time from which on rows are others, where that may be; of these it is one in the end.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Shape:
     refined: bool = True
     alike: str = ""
     told: float | None = None
+    moments: tuple[float, ...] = ()
 
     @property
     def textbook(self) -> float | None:

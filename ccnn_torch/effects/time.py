@@ -394,7 +394,8 @@ class Homing(Effect):
             return ()
         whole = max(float(_passed(situation).max()), 1e-6)
         unit = "s" if "time" in situation.covariates else ""
-        return (Shape("begin", unit, tuple(whole * k / _ZERO_BEGINS for k in range(1, _ZERO_BEGINS))),)
+        begins = tuple(whole * k / _ZERO_BEGINS for k in range(1, _ZERO_BEGINS))
+        return (Shape("begin", unit, begins, moments=_moments(situation)[1:]),)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x (n · sessions)`."""
@@ -454,7 +455,7 @@ class FrameDrift(Effect):
         begins = tuple(whole * k / _BEGINS for k in range(_BEGINS))
         settlings = tuple(whole * share for share in _SETTLINGS)
         return (
-            Shape("begin", unit, begins, usual=0.0),
+            Shape("begin", unit, begins, usual=0.0, moments=_moments(situation)[:-1]),
             Shape("settling", unit, settlings, usual=settlings[-1]),
         )
 
@@ -476,6 +477,11 @@ class FrameDrift(Effect):
         whole = -torch.expm1(-(passed.amax(-1, keepdim=True) - begin).clamp_min(1e-300) / rate)
         share = (gone / whole).unsqueeze(-1)
         return share.expand(*share.shape[:-1], len(self.coefficients(situation)))
+
+
+def _moments(situation: Situation) -> tuple[float, ...]:
+    """All times of rows, as of `_passed`, ascending."""
+    return tuple(torch.unique(_passed(situation)).tolist())
 
 
 def _passed(situation: Situation) -> Tensor:

@@ -40,7 +40,7 @@ def measured(seed: int, wrong: str, days: int = 4, rows: int = 80) -> tuple[Situ
     sizes = draw.choice([-1, 1], 2) * draw.uniform(2e-4, 5e-4, 2)
     off = {
         "homing": draw.normal(0, 2e-4, (days, 2))[day],
-        "tooth": np.outer(np.arange(rows) >= rows * 0.6, [0.0, sizes[1]]),
+        "tooth": np.outer(np.arange(rows) >= int(rows * 0.6), [0.0, sizes[1]]),
         "drift": np.outer(time / time[-1], sizes),
         "joint_offset": np.tile(sizes, (rows, 1)),
     }
@@ -82,6 +82,19 @@ def test_a_zero_that_is_another_one_from_a_row_on_is_named_with_its_joint(timed:
     assert said.verdict["shrink"] > 0.9
     told = next(e for e in said.effects if e["name"] == "homing")["parameters"]
     assert set(told) == {"q2 from then on", "begin"} and abs(told["q2 from then on"]["value"]) > 1.9e-4
+
+
+@pytest.mark.parametrize("rows", range(800, 805))
+def test_it_begins_at_its_row_also_where_that_was_not_among_those_searched(rows: int) -> None:
+    """A row on the wrong side leaves far more than noise, and the time as a driver outside the library."""
+    situation, poses = measured(rows, "tooth", days=1, rows=rows)
+    said = diagnose_rows(situation, poses, torch.full((3,), 1e-5, dtype=torch.float64))
+    assert said.verdict["effects"] == ["homing"] and said.verdict["probability"] > 0.8
+    before, after = (
+        situation.covariates["time"][int(rows * 0.6) - k] - situation.covariates["time"][0] for k in (1, 0)
+    )
+    told = next(e for e in said.effects if e["name"] == "homing")["parameters"]["begin"]["value"]
+    assert before < told <= after
 
 
 def test_geometry_is_fitted_beside_it_and_the_machine_has_no_zero_of_a_day() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
+from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -35,6 +36,8 @@ _AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
 _PEAKS, _AS_HIGH = 4, 0.02
 # Shapes that share coefficients are searched together where that are no more values.
 _TOGETHER = 300
+# Times of rows near the best one that are tried in the end, for each row that was evaluated.
+_MOMENTS = 16
 # Log evidence for each coefficient whose shape is worth its search.
 _PAYS = 1.5
 
@@ -94,6 +97,7 @@ class SearchRows:
         left: what the others leave there.
         times: how many values there are for each that is evaluated.
         rounds: how often values between the neighbours of the best are evaluated.
+        every: whitened residual and columns of all rows.
     """
 
     def __init__(self, y: Tensor, others: Tensor, quick: bool = False) -> None:
@@ -107,6 +111,12 @@ class SearchRows:
         self.left = NuisanceFit(_of(y, self.rows, 0), _of(others, self.rows, 0))
         self.times = y.numel() / self.left.y.numel()
         self.rounds = 1 if quick else ROUNDS
+        self.every = y, others
+
+    @cached_property
+    def left_of_all(self) -> NuisanceFit:
+        """What the others leave in all rows."""
+        return NuisanceFit(*self.every) if self.rows is not None else self.left
 
 
 class Scan:
@@ -177,7 +187,7 @@ class Scan:
     def _lead(self, columns: Tensor, which: Sequence[int], rows: Tensor | None) -> SharedColumns:
         """Some of the columns in the rows evaluated, which are the same all along: one object, however often it is
         asked for."""
-        key = tuple(which)
+        key = (rows is None, *which)
         if key not in self.leads:
             self.leads[key] = SharedColumns(_of(columns, rows, 0)[..., list(which)])
         return self.leads[key]
@@ -250,7 +260,23 @@ class Scan:
                 value = value.clone()
                 for i, part in enumerate(self.parts):
                     value[part.shapes] = candidates[chosen[i]][part.shapes]
+        if self._promising(gains, charges):
+            value = self._at_moments(value, ground)
         return self._worth(value, gains, charges, times)
+
+    def _at_moments(self, value: Tensor, ground: SearchRows) -> Tensor:
+        """Shapes with times from which on rows are others at one of these: a row that was not evaluated does not tell
+        on which side it is, and one on the wrong side leaves more than noise."""
+        for i, part in enumerate(self.parts):
+            for h in part.shapes:
+                moments = torch.tensor(self.shapes[h].moments, dtype=value.dtype)
+                near = (moments - value[h]).abs().argsort()[: math.ceil(_MOMENTS * ground.times)]
+                if len(near):
+                    candidates = value.expand(len(near), -1).clone()
+                    candidates[:, h] = moments[near]
+                    left = ground.left_of_all.beside(self.unshaped)
+                    value = candidates[int(left.gain(self.columns(candidates, None)[i]).argmax())]
+        return value
 
     def _promising(self, gains: Sequence[float], charges: Sequence[float]) -> bool:
         """Whether any part explains more than chance at the best value of its grid."""
