@@ -12,6 +12,7 @@ from ccnn_torch.compensation.expansions import expand
 from ccnn_torch.compensation.inverse_machine import MOST_NEWTON, InverseMachine, inner_of
 from ccnn_torch.compensation.machine import RULE, ForwardMachine, Machine, Rule
 from ccnn_torch.effects import Acting, Situation
+from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 
 # Error of the polynomial from which Newton's method comes to the right pose, as a share of the largest.
@@ -33,6 +34,7 @@ def machine_of(
     Raises:
         InputError, MethodFailedError: what effects see of the machine, or where it is, is no polynomial of the joints.
     """
+    _refuse_redundant(rows.mechanism)
     effects = expand_effects(rows, acting, covariates, margin) if acting else None
     return build_machine(rows.mechanism, values, effects, rows.joints, margin)
 
@@ -57,6 +59,7 @@ def build_machine(
     Raises:
         InputError, MethodFailedError: as `expand`.
     """
+    _refuse_redundant(mechanism)
     way = _closed_form_of(mechanism)
     if way == "forward":
         return ForwardMachine(mechanism, identified, effects, rule)
@@ -67,6 +70,16 @@ def build_machine(
     made = InverseMachine(mechanism, identified, effects, rule, start)
     made.newton = max(one.steps_needed(joints, MOST_NEWTON) for one in made._closed)
     return made
+
+
+def _refuse_redundant(mechanism: Mechanism) -> None:
+    """Raise `MethodFailedError` for a machine whose drives do not fit each other but where a pose is: cables, say."""
+    n, p = len(mechanism.joints), len(mechanism.pose)
+    if n > p and _closed_form_of(mechanism) is None:
+        raise MethodFailedError(
+            f"{mechanism.name} has {n} joints and {p} pose coordinates, and no model file holds such a machine: take "
+            "the commanded pose for its joints, and let `closure` say where the drives then hold it"
+        )
 
 
 def _closed_form_of(mechanism: Mechanism) -> str | None:

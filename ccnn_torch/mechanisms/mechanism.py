@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
+from functools import cached_property, wraps
 from typing import Any, Literal
 
 import torch
@@ -146,7 +147,8 @@ class Mechanism(nn.Module):
             `... x c` [SI].
         """
         if type(self).solve_inverse is not Mechanism.solve_inverse:
-            return self.wrap(self.solve_inverse(pose, parameters, joints) - joints)
+            off = self.solve_inverse(pose, parameters, joints) - joints
+            return torch.where(torch.tensor(self._turning, device=off.device), wrap_angle(off), off)
         gap = self.forward_kinematics(joints, parameters, pose) - pose
         turning = torch.tensor([c.unit == "rad" for c in self.pose], device=gap.device)
         return torch.where(turning, wrap_angle(gap), gap)
@@ -267,6 +269,16 @@ class Mechanism(nn.Module):
         """A difference of joints, `... x n` [SI], with revolute ones (unit rad) brought to [-pi, pi]."""
         revolute = torch.tensor([j.unit == "rad" for j in self.joints], device=deviation.device)
         return torch.where(revolute, wrap_angle(deviation), deviation)
+
+    @cached_property
+    def _turning(self) -> list[bool]:
+        """Which joints turn, no more than once in the workspace: the turns of those that go farther, winches and
+        motors, count."""
+        corners = torch.cartesian_prod(*torch.stack([self.low, self.high], -1).detach())
+        joints = self.solve_inverse(corners.reshape(-1, len(self.pose)))
+        joints = torch.where(torch.isfinite(joints), joints, self.home_joints)
+        once = (joints.amax(0) - joints.amin(0)) <= 2 * math.pi
+        return [j.unit == "rad" and one for j, one in zip(self.joints, once.tolist(), strict=True)]
 
     def nearest_joints(
         self,

@@ -50,7 +50,8 @@ OURS = {
     "diagnosed": (CLASS % ("Commanded", ""), "diagnose"),
     "lines": (CLASS % ("Commanded", ", elastic: false"), "run"),
     "process": (CLASS % ("Commanded", ", elastic: false") + "geometry: none\neffects: none\nmethods: [gp]\n", "run"),
-    "winches": (CLASS % ("WinchesBoth", ""), "run"),
+    "winches": (CLASS % ("Winches", ""), "run"),
+    "winches diagnosed": (CLASS % ("Winches", ""), "diagnose"),
 }
 CAUSES = ("anchors", "pulleys", "drums", "homing", "weight", "payload", "softness", "warmth", "scatter")
 
@@ -87,7 +88,7 @@ def hanging(pose: Array, masses: Array, centres: Array) -> Array:
 def turned(pose: Array, step: Array) -> Array:
     """A pose after a small shift and turn, `s x 6`."""
     turn = Rotation.from_rotvec(step[:, 3:]) * Rotation.from_rotvec(pose[:, 3:])
-    return np.c_[pose[:, :3] + step[:, :3], turn.as_rotvec()]
+    return np.asarray(np.c_[pose[:, :3] + step[:, :3], turn.as_rotvec()])
 
 
 class Robot:
@@ -142,7 +143,7 @@ class Robot:
         middle = balls.mean(1)
         mean = BALLS.mean(0)
         turns = Rotation.concatenate([Rotation.align_vectors(one - one.mean(0), BALLS - mean)[0] for one in balls])
-        return np.c_[middle - turns.apply(mean), turns.as_rotvec()]
+        return np.asarray(np.c_[middle - turns.apply(mean), turns.as_rotvec()])
 
     def measured(self, angles: Array, told: Array, rng: np.random.Generator) -> Array:
         """As recorded, `s x 6`: winches stop with scatter, friction of the pulleys in it."""
@@ -172,7 +173,7 @@ def drawn(pose: Array) -> Array:
 
 def places(rows: int, rng: np.random.Generator, warm: tuple[float, float] | None = None) -> tuple[Array, Array]:
     """Poses all over the workspace, and temperature and payload; the hall warms by the row, or is of a range."""
-    pose, heat = rng.uniform(LOW, HIGH, (rows, 6)), rng.uniform(*(warm or (19, 26)), rows)
+    pose, heat = rng.uniform(LOW, HIGH, (rows, 6)), rng.uniform(*(warm or (19.0, 26.0)), size=rows)
     return pose, np.c_[heat if warm else np.sort(heat), rng.choice(LOADS, rows)]
 
 
@@ -185,7 +186,7 @@ def plain_fit(angles: Array, seen: Array) -> Array:
     """Leg by leg: straight lengths at the measured poses against what the winches gave."""
 
     def residuals(u: Array) -> Array:
-        return np.r_[(DRUM * (plain_angles(u * SIZES[:64], seen) - angles)).ravel() / 4e-4, u]
+        return np.asarray(np.r_[(DRUM * (plain_angles(u * SIZES[:64], seen) - angles)).ravel() / 4e-4, u])
 
     return np.asarray(least_squares(residuals, np.zeros(64)).x * SIZES[:64])
 
@@ -227,7 +228,7 @@ def full_fit(angles: Array, seen: Array, told: Array) -> Array:
 
     def residuals(u: Array) -> Array:
         off = full_off(start + u * SIZES, angles, seen, told)
-        return np.r_[(off / [*[1e-4] * 3, *[4e-4] * 3]).ravel(), u]
+        return np.asarray(np.r_[(off / [*[1e-4] * 3, *[4e-4] * 3]).ravel(), u])
 
     return np.asarray(start + least_squares(residuals, np.zeros(75)).x * SIZES)
 

@@ -22,7 +22,8 @@ def matrix(turn: Tensor) -> Tensor:
     """Rotation matrix of a rotation vector."""
     x, y, z = turn.unbind(-1)
     cross = torch.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x], -1).reshape(*turn.shape[:-1], 3, 3)
-    return torch.linalg.matrix_exp(cross)
+    found: Tensor = torch.linalg.matrix_exp(cross)
+    return found
 
 
 def cables(pose: Tensor, inlets: Tensor, ends: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,7 +59,8 @@ def leaving() -> Tensor:
 
 def straight(pose: Tensor, points: Tensor, ends: Tensor) -> Tensor:
     """Lengths of cables that are straight lines from points, `... x 8`."""
-    return torch.linalg.vector_norm(pose[..., None, :3] + ends @ matrix(pose[..., 3:]).mT - points, dim=-1)
+    found: Tensor = torch.linalg.vector_norm(pose[..., None, :3] + ends @ matrix(pose[..., 3:]).mT - points, dim=-1)
+    return found
 
 
 def numbers(points: Tensor, ends: Tensor, lengths: Tensor) -> list[Parameter]:
@@ -93,33 +95,12 @@ class Winches(Mechanism):
             home_joints=[0.0] * 8,
         )
 
-    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:  # type: ignore[override]
         """Angles of the winches, `... x 8` [rad]."""
         values = self.resolve(parameters)
         values = values.reshape(*values.shape[:-1], 8, 8)
         lengths = straight(pose, values[..., :3], values[..., 3:6])
         return (lengths - values[..., 6]) / values[..., 7]
-
-
-class WinchesBoth(Winches):
-    """The same with the platform where lengths fit best: eight cables cannot all fit."""
-
-    def forward_kinematics(self, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Gauss and Newton from home, `... x 6`."""
-        values = self.resolve(parameters)
-        values = values.reshape(*values.shape[:-1], 8, 8)
-        points, ends = values[..., :3], values[..., 3:6]
-        wanted = values[..., 6] + values[..., 7] * joints
-        pose = torch.tensor([0, 0, HOME, 0, 0, 0], dtype=torch.float64).expand(*wanted.shape[:-1], 6)
-        for _ in range(12):
-            arm = ends @ matrix(pose[..., 3:]).mT
-            away = pose[..., None, :3] + arm - points
-            length = torch.linalg.vector_norm(away, dim=-1)
-            way = away / length[..., None]
-            rows = torch.cat([way, torch.linalg.cross(arm, way)], -1)
-            step = torch.linalg.solve(rows.mT @ rows, (rows.mT @ (wanted - length)[..., None]))[..., 0]
-            pose = torch.cat([pose[..., :3] + step[..., :3], composed(step[..., 3:], pose[..., 3:])], -1)
-        return pose
 
 
 def composed(step: Tensor, turn: Tensor) -> Tensor:
@@ -132,7 +113,8 @@ def composed(step: Tensor, turn: Tensor) -> Tensor:
     (a, u), (b, v) = quaternion(step), quaternion(turn)
     real, part = a * b - (u * v).sum(-1, keepdim=True), a * v + b * u + torch.linalg.cross(u, v)
     size = torch.sqrt((part**2).sum(-1, keepdim=True) + 1e-30)
-    return part / size * 2 * torch.atan2(size, real)
+    found: Tensor = part / size * 2 * torch.atan2(size, real)
+    return found
 
 
 class Commanded(Mechanism):
@@ -176,7 +158,8 @@ class Commanded(Mechanism):
             length = torch.linalg.vector_norm(away, dim=-1)
             way = away / length[..., None]
             rows = torch.cat([way, torch.linalg.cross(arm, way)], -1)
-            return torch.linalg.solve(rows.mT @ rows, rows.mT @ (length - slack)[..., None])[..., 0]
+            fitted: Tensor = torch.linalg.solve(rows.mT @ rows, rows.mT @ (length - slack)[..., None])[..., 0]
+            return fitted
         length, rows = cables(pose, each[..., :3], each[..., 3:6], values[..., 64, None])
         stiff = EA / (values[..., 65, None] * (slack + DEAD))
         arm = (matrix(pose[..., 3:]) @ values[..., 66:69, None])[..., 0]
@@ -186,9 +169,10 @@ class Commanded(Mechanism):
         if self.slack:
             pull = torch.nn.functional.softplus(pull / 2) * 2  # N, smooth within some newtons of 0
         push = (rows.mT @ pull[..., None])[..., 0] - hung
-        return torch.linalg.solve(rows.mT @ (stiff[..., None] * rows), push[..., None])[..., 0]
+        away_from_rest: Tensor = torch.linalg.solve(rows.mT @ (stiff[..., None] * rows), push[..., None])[..., 0]
+        return away_from_rest
 
-    def forward_kinematics(self, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def forward_kinematics(self, joints: Tensor, parameters: Tensor | None = None) -> Tensor:  # type: ignore[override]
         """The platform at rest, `... x 6`, from where it is commanded to: from home some poses are found elsewhere."""
         pose = joints + 0 * self.resolve(parameters)[..., :6]
         for _ in range(20 if self.slack else 8):
@@ -196,7 +180,7 @@ class Commanded(Mechanism):
             pose = torch.cat([pose[..., :3] - step[..., :3], composed(-step[..., 3:], pose[..., 3:])], -1)
         return pose
 
-    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:  # type: ignore[override]
         """The pose to command, `... x 6`, from the wanted one: from home 4 of 10 are not found with `slack`."""
         joints = pose + 0 * self.resolve(parameters)[..., :6]
         for _ in range(40 if self.slack else 8):
