@@ -75,7 +75,9 @@ def build_machine(
 def _refuse_redundant(mechanism: Mechanism) -> None:
     """Raise `MethodFailedError` for a machine whose drives do not fit each other but where a pose is: cables, say."""
     n, p = len(mechanism.joints), len(mechanism.pose)
-    if n > p and _closed_form_of(mechanism) is None:
+    # One that says itself where its joints take it has joints to choose from, and none that do not fit.
+    says_itself = type(inner_of(mechanism)).forward_kinematics is not Mechanism.forward_kinematics
+    if n > p and not says_itself and _closed_form_of(mechanism) is None:
         raise MethodFailedError(
             f"{mechanism.name} has {n} joints and {p} pose coordinates, and no model file holds such a machine: take "
             "the commanded pose for its joints, and let `closure` say where the drives then hold it"
