@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,6 +19,18 @@ EXACT = (1e-8, 1e-8)
 """Largest pose error at joints that were computed [m, rad]."""
 ROUNDED = (1e-4, 1e-3)
 """The same of poses that a controller showed rounded, which a machine of few joints misses by that [m, rad]."""
+
+
+def turning(mechanism: Mechanism) -> Tensor:
+    """Joints whose values a turn apart are one, `n` bool: of unit rad, and within one turn all over the workspace.
+
+    Those that go farther, winches and motors, are counted on.
+    """
+    corners = torch.cartesian_prod(*torch.stack([mechanism.low, mechanism.high], -1).detach())
+    joints = mechanism.solve_inverse(corners.reshape(-1, len(mechanism.pose)))
+    joints = torch.where(torch.isfinite(joints), joints, mechanism.home_joints)
+    revolute = torch.tensor([j.unit == "rad" for j in mechanism.joints], device=joints.device)
+    return revolute & (joints.amax(0) - joints.amin(0) <= 2 * math.pi)
 
 
 def arrives(mechanism: Mechanism, joints: Tensor, poses: Tensor, within: tuple[float, float] = EXACT) -> Tensor:

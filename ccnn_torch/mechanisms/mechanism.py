@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, wraps
 from typing import Any, Literal
@@ -25,6 +24,7 @@ from ccnn_torch.mechanisms.pose import (
 )
 from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, wrap_angle
+from ccnn_torch.numerics.sampling import drawn_within
 
 
 class InverseKinematics(nn.Module):
@@ -148,7 +148,7 @@ class Mechanism(nn.Module):
         """
         if type(self).solve_inverse is not Mechanism.solve_inverse:
             off = self.solve_inverse(pose, parameters, joints) - joints
-            return torch.where(torch.tensor(self._turning, device=off.device), wrap_angle(off), off)
+            return torch.where(self._turning.to(off.device), wrap_angle(off), off)
         gap = self.forward_kinematics(joints, parameters, pose) - pose
         turning = torch.tensor([c.unit == "rad" for c in self.pose], device=gap.device)
         return torch.where(turning, wrap_angle(gap), gap)
@@ -271,14 +271,8 @@ class Mechanism(nn.Module):
         return torch.where(revolute, wrap_angle(deviation), deviation)
 
     @cached_property
-    def _turning(self) -> list[bool]:
-        """Which joints turn, no more than once in the workspace: the turns of those that go farther, winches and
-        motors, count."""
-        corners = torch.cartesian_prod(*torch.stack([self.low, self.high], -1).detach())
-        joints = self.solve_inverse(corners.reshape(-1, len(self.pose)))
-        joints = torch.where(torch.isfinite(joints), joints, self.home_joints)
-        once = (joints.amax(0) - joints.amin(0)) <= 2 * math.pi
-        return [j.unit == "rad" and one for j, one in zip(self.joints, once.tolist(), strict=True)]
+    def _turning(self) -> Tensor:
+        return _branches.turning(self)
 
     def nearest_joints(
         self,
@@ -487,19 +481,6 @@ class Mechanism(nn.Module):
             raise InputError(f"mechanism '{self.name}' has the parameters {', '.join(names)}; check {', '.join(wrong)}")
         self.nominal.copy_(self.nominal.new_tensor([float(values[n]) for n in names]))
         self._follow_nominal()
-
-
-def drawn_within(
-    low: Tensor, high: Tensor, count: int, generator: torch.Generator, good: Callable[[Tensor], Tensor], wrong: str
-) -> Tensor:
-    """Points uniform in a box that are good (`s x d` to `s` bool), `count x d`; `wrong` where hardly any is."""
-    found: list[Tensor] = []
-    for _ in range(100):
-        points = low + (high - low) * torch.rand(count, len(low), generator=generator, dtype=torch.float64)
-        found.append(points[good(points)])
-        if sum(map(len, found)) >= count:
-            return torch.cat(found)[:count]
-    raise InputError(wrong)
 
 
 def _without_guess(verb: Callable[[Any, Tensor, Tensor | None], Tensor]) -> Callable[..., Tensor]:

@@ -12,13 +12,13 @@ from torch import Tensor
 from ccnn_torch.coordinates import Condition, Coordinate, plausible_error
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.closest import Closest
-from ccnn_torch.mechanisms.mechanism import drawn_within
 from ccnn_torch.mechanisms.newton import carry_derivative
 from ccnn_torch.mechanisms.pose import Frame, frame_from_coordinates, frame_gap, frame_jacobian
 from ccnn_torch.mechanisms.simulators.simulator import Calls, Simulator, described, try_simulator
 from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.sampling import drawn_within
 
 
 def central_slope(
