@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from ccnn_torch.mechanisms.dh_file import urdf_joints
 from ccnn_torch.mechanisms.frames.judge import coupled_count
 from ccnn_torch.mechanisms.registry import REGISTRY, dimensions
 from ccnn_torch.motion.log import load_logs
+from ccnn_torch.plugins import is_plugin
 from ccnn_torch.records import DEFAULT_COVARIATES
 from ccnn_torch.records.commanded import GOAL
 from ccnn_torch.records.formats import form_of
@@ -91,10 +92,11 @@ class Recognised:
         return "m" if name in _POSITION else "1" if name in ("qw", "qx", "qy", "qz") else "rad"
 
 
-def recognise(table: Table, joints: Sequence[str] = ()) -> Recognised:
+def recognise(table: Table, joints: Sequence[str] = (), pose: Iterable[str] = ()) -> Recognised:
     """Find joints (q1, J1, A1, joint_1, axis1, …) and pose columns by their names, ignoring case.
 
     joints: what the mechanism's file calls them; a column may say after it that it is a position.
+    pose: names of the mechanism's own coordinates.
     """
     folded = {name: _folded(name) for name in table.names}
     families: dict[str, dict[int, str]] = {}
@@ -115,7 +117,7 @@ def recognise(table: Table, joints: Sequence[str] = ()) -> Recognised:
         family = dict(enumerate(own, 1))
     meaning = {family[k]: f"q{k}" for k in sorted(family)}
     wanted = _POSITION | {c.name for name in REGISTRY if name not in _OPEN for c in load_mechanism(name).pose}
-    wanted -= {"rx", "ry", "rz"}
+    wanted = (wanted | {*pose}) - {"rx", "ry", "rz"}
     by_plain = {plain: name for name, plain in reversed(folded.items()) if name not in meaning}
     by_plain = {m[1]: name for plain, name in by_plain.items() if (m := _MEASURED.fullmatch(plain))} | by_plain
     meaning |= {by_plain[plain]: ours for ours in sorted(wanted) if (plain := ours.replace("_", "")) in by_plain}
@@ -227,8 +229,7 @@ def choose_split(positions: np.ndarray[tuple[int, int], np.dtype[np.float64]] | 
 
 def _repeats(rows: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> bool:
     """Whether at least a fifth of the rows repeats the position of another one, at 10 positions or more."""
-    distinct = len(np.unique(rows, axis=0))
-    return 10 <= distinct <= 0.8 * len(rows)
+    return 10 <= len(np.unique(rows, axis=0)) <= 0.8 * len(rows)
 
 
 def _kind(unit: str) -> str | None:
@@ -269,7 +270,9 @@ def starter_config(
     table = read_source(records)
     if {"time", "command1", "q1"} <= {*table.names}:
         return _motion_config(records, out, mechanism, {})
-    found = recognise(table, urdf_joints(mechanism) if mechanism and mechanism.lower().endswith(".urdf") else ())
+    given = None if mechanism is None else load_mechanism(mechanism)
+    named = urdf_joints(mechanism) if mechanism and mechanism.lower().endswith(".urdf") else ()
+    found = recognise(table, named, () if given is None else [c.name for c in given.pose])
     if not (found.joints or found.goals) or not found.pose:
         if {"time", "command"} <= {name.rstrip("0123456789_ ") for name in map(str.lower, table.names)}:
             raise InputError(
@@ -410,8 +413,10 @@ def _split(found: Recognised, table: Table, columns: dict[str, str]) -> tuple[st
 
 def _mechanism_lines(name: str | None, why: str, out: Path) -> list[str]:
     if name is not None:
-        path = _relative(Path(name), out) if Path(name).is_file() else name
-        return [f"mechanism: {json.dumps(path, ensure_ascii=False)}   # {why}", *_dimension_lines(name)]
+        file, colon, of = name.rpartition(":") if is_plugin(name) else (name, "", "")
+        path = _relative(Path(file), out) + colon + of if Path(file).is_file() else name
+        keys = ["mechanism_keys: {allow_code: true}   # it is Python code"] if colon else _dimension_lines(name)
+        return [f"mechanism: {json.dumps(path, ensure_ascii=False)}   # {why}", *keys]
     fitting = f" ({why} would fit)" if why else ""
     return [
         f"# FILL IN the machine{fitting}: a built-in name, or an arm's geometry as a DH file (.yaml) or URDF;",
@@ -423,9 +428,8 @@ def _mechanism_lines(name: str | None, why: str, out: Path) -> list[str]:
 def _dimension_lines(name: str) -> list[str]:
     """The dimensions that a built-in machine is taken to have."""
     sizes = dimensions(name)
-    if not sizes:
-        return []
-    return ["# Its dimensions [m, rad]; write those of your machine:", f"# mechanism_keys: {{{sizes}}}"]
+    keys = ["# Its dimensions [m, rad]; write those of your machine:", f"# mechanism_keys: {{{sizes}}}"]
+    return keys if sizes else []
 
 
 def _column_lines(columns: dict[str, str], found: Recognised, table: Table, why: str) -> list[str]:
@@ -471,8 +475,8 @@ def _count_lines(
 
 
 def _other_lines(found: Recognised, table: Table) -> list[str]:
-    inputs = [name for name in matching(found.unknown, DEFAULT_COVARIATES) if table.units[name]]
-    inputs += [target.partition("[")[0] for target in found.inputs.values()]
+    told = [target.partition("[")[0] for target in found.inputs.values()]
+    inputs = [name for name in matching(found.unknown, DEFAULT_COVARIATES) if table.units[name]] + told
     read = {*DEFAULT_COVARIATES, *([PAYLOAD] if "load_z" in inputs else [])}
     ignored = [name for name in found.unknown if not matching([name], [*read])]
     lines = [f"# Inputs beside the joints, by their names: {', '.join(inputs)}."] if inputs else []

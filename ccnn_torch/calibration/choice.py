@@ -20,6 +20,7 @@ from ccnn_torch.learners import make_learner
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.mechanisms.frames.partial import completed
+from ccnn_torch.mechanisms.pose import only_turns
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records
@@ -137,7 +138,9 @@ def choose_model(
     except (InputError, MethodFailedError) as problem:
         why = f"Candidates could not be cross-validated: {problem}"
         return ModelChoice(geometry == "identify", effects[0], other, why)
-    return simplest_of_best(errors, asked)
+    # A machine that only turns errs by angles, which count as the lengths that they are at the weight's arm.
+    shown = ("mrad", settings["rotation_weight"]) if only_turns(mechanism.frame(few.pose)) else ("mm", 1.0)
+    return simplest_of_best(errors, asked, *shown)
 
 
 def _errors(
@@ -228,12 +231,14 @@ def _learned(
     return predict
 
 
-def simplest_of_best(errors: dict[Candidate, Tensor], asked: str) -> ModelChoice:
+def simplest_of_best(errors: dict[Candidate, Tensor], asked: str, unit: str = "mm", length: float = 1.0) -> ModelChoice:
     """The simplest that none of the others beats by more than two standard errors over the folds.
 
     Args:
         errors: mean squared pose error by fold, `k` [m²], by candidate, the simplest first.
         asked: what was asked for, a sentence or nothing.
+        unit: of the errors that are told.
+        length: that makes a told error one [m], in thousandths: 1, or of an angle its weight [m/rad].
     """
     # By ratio: a fold with a row near a singular pose errs many times as much as the others in all.
     logs = torch.stack([e.log() for e in errors.values()])
@@ -241,7 +246,7 @@ def simplest_of_best(errors: dict[Candidate, Tensor], asked: str) -> ModelChoice
     is_beaten = (worse.mean(-1) > _ERRORS * worse.std(-1) / math.sqrt(logs.shape[-1])).any(-1).tolist()
     # The one with the least mean is beaten by none.
     chosen = next(c for c, beaten in zip(errors, is_beaten, strict=True) if not beaten)
-    said = ", ".join(f"{c.words} {1e3 * math.sqrt(float(e.mean())):.3g} mm" for c, e in errors.items())
+    said = ", ".join(f"{c.words} {1e3 * math.sqrt(float(e.mean())) / length:.3g} {unit}" for c, e in errors.items())
     why = f"{chosen.words.capitalize()}: the simplest of the best in cross-validation (held-out RMS: {said})."
     method = _LEARNER if chosen.learner else "constant"
     return ModelChoice(chosen.identify, chosen.effects, method, f"{asked} {why}".strip(), "folds")

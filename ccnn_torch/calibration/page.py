@@ -56,14 +56,14 @@ def run_page(results: RunResults, figures: Sequence[InlineFigure] = (), folder: 
 
 def _answers(results: RunResults, folder: Path | None) -> list[Answer]:
     """What each part of the model leaves of the RMS position error, where it has parts, and what to do next."""
-    position, best, told = results.pose.position, results.best_method, list[Answer]()
+    (kind, error), best, told = results.pose.told, results.best_method, list[Answer]()
     if best is not None and results.pose.parts:
-        steps = [("as it is", position.before), *((part, position[part]) for part in results.pose.parts)]
+        steps = [("as it is", error.before), *((part, error[part]) for part in results.pose.parts)]
         parts = []
-        for name, block in [*steps, (best, position.after)]:
-            size = with_unit(block.rms.median, "m")
+        for name, block in [*steps, (best, error.after)]:
+            size = with_unit(block.rms.median, error.unit)
             parts.append(f"{size} {name}" if name == "as it is" else f"with {name} {size}")
-        told.append(Answer("Step by step", f"{', '.join(parts)} (RMS position error on held-out rows)."))
+        told.append(Answer("Step by step", f"{', '.join(parts)} (RMS {kind} error on held-out rows)."))
     if folder is not None and results.records is not None:
         path = typed_path(str(folder))
         if not pays(results):
@@ -81,21 +81,21 @@ def _answers(results: RunResults, folder: Path | None) -> list[Answer]:
 
 def verdict(results: RunResults) -> str:
     """One sentence: what the best method does to the error on held-out rows."""
-    position, methods = results.pose.position, results.methods
+    (kind, error), methods = results.pose.told, results.methods
     best = results.best_method or next(iter(methods), "the model")
     # What is left is left of both: the identified geometry, and what the method learned of the rest.
     whose = " + ".join([*results.pose.parts, best])
     rows = count_text(results.rows.test, "held-out row")
-    before, after = position.before.rms, position.after.rms
+    before, after = error.before.rms, error.after.rms
     removed = removed_percent(before, after)
     if removed is None:
         return f"On {rows} the pose error of {whose} could not be measured."
-    left, right, unit = _both(before.median, after.median)
+    left, right, unit = _both(before.median, after.median, error.unit)
     did = f"removes {removed:.1f} %" if removed >= 0 else f"adds {-removed:.1f} %"
-    text = f"On {rows} {whose} {did} of the RMS position error ({left} → {right} {unit})"
-    others = position.without_outliers
+    text = f"On {rows} {whose} {did} of the RMS {kind} error ({left} → {right} {unit})"
+    others = error.without_outliers
     if others is not None:
-        left, right, unit = _both(others.before.median, others.after.median)
+        left, right, unit = _both(others.before.median, others.after.median, error.unit)
         text += f"; {left} → {right} {unit} without {count_text(others.rows, 'row')} far from every model"
     ratio = methods[best].ratio_to_floor if best in methods else None
     if ratio is not None and ratio.median is not None:
@@ -106,9 +106,9 @@ def verdict(results: RunResults) -> str:
     return text + "."
 
 
-def _both(before: float | None, after: float | None) -> tuple[str, str, str]:
-    """Two position errors [m] in the unit of the first, and the unit."""
-    scale, unit = display_unit("m", before)
+def _both(before: float | None, after: float | None, of: str) -> tuple[str, str, str]:
+    """Two errors [`of`] in the prefixed unit of the first, and this unit."""
+    scale, unit = display_unit(of, before)
     left, right = (number_text(None if value is None else value / scale, 3) for value in (before, after))
     return left, right, unit
 
@@ -145,31 +145,31 @@ def write_tables(folder: Path, results: RunResults) -> None:
 
 def pays(results: RunResults) -> bool:
     """Whether the model leaves less on held-out rows than no correction does, and than its own parts."""
-    position = results.pose.position
-    removed = removed_percent(position.before.rms, position.after.rms)
+    _, error = results.pose.told
+    removed = removed_percent(error.before.rms, error.after.rms)
     return not worse_text(results) and (removed is None or removed > 0)
 
 
 def worse_text(results: RunResults) -> str:
-    """One sentence where the best method's RMS position error on held-out rows is larger than without it; else empty.
+    """One sentence where the best method's RMS pose error on held-out rows is larger than without it; else empty.
 
     Without it: the best of no correction, identified geometry, and known effects with it.
     """
-    position, best, parts = results.pose.position, results.best_method, results.pose.parts
-    steps = {"no correction at all": position.before.rms.median}
+    (kind, error), best, parts = results.pose.told, results.best_method, results.pose.parts
+    steps = {"no correction at all": error.before.rms.median}
     for k, part in enumerate(parts):
-        steps[f"{' + '.join(parts[: k + 1])} alone"] = position[part].rms.median
+        steps[f"{' + '.join(parts[: k + 1])} alone"] = error[part].rms.median
     # Of steps as good as each other the last one says more.
     instead, alone = min(reversed(steps.items()), key=lambda step: step[1] or math.inf)
-    after = position.after.rms.median
+    after = error.after.rms.median
     if best is None or not alone or after is None or after <= _WORSE * alone:
         return ""
-    left, right, unit = _both(alone, after)
+    left, right, unit = _both(alone, after, error.unit)
     what = " + ".join([*parts, best])
     if parts and instead.startswith(" + ".join(parts)):
         what = best
-    text = f"On held-out rows {what} makes it worse than {instead} ({left} → {right} {unit} RMS position error)"
-    if parts and position.explained is not None and (position.explained.rms.median or after) <= _WORSE * alone:
+    text = f"On held-out rows {what} makes it worse than {instead} ({left} → {right} {unit} RMS {kind} error)"
+    if parts and error.explained is not None and (error.explained.rms.median or after) <= _WORSE * alone:
         return (
             f"{text}: the model is right, but its file holds commands back near singular poses or at limits; "
             "what it explains is reached in the rows whose status is 0."

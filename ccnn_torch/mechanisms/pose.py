@@ -55,6 +55,11 @@ def frame_gap(there: Frame, here: Frame, rotation_weight: float) -> Tensor:
     return torch.cat([shift.expand(*lead, -1), rotation_weight * turn.expand(*lead, -1)], dim=-1)
 
 
+def only_turns(frame: Frame) -> bool:
+    """Whether frames of several poses, `s`, have one position: their errors are of the rotation alone."""
+    return frame[1] is not None and bool((frame[0] == frame[0][:1]).all())
+
+
 def frame_from_coordinates(pose: Tensor, coordinates: tuple[Coordinate, ...], name: str) -> Frame:
     """Frame of a pose whose coordinates are named x, y, z and rx, ry, rz."""
     columns = {c.name: pose[..., i] for i, c in enumerate(coordinates)}

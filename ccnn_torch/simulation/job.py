@@ -18,6 +18,7 @@ from ccnn_torch.effects.time import Homing
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import make_folder
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism, sees_directions
+from ccnn_torch.mechanisms.pose import only_turns
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records import name_lines, write_table
 from ccnn_torch.records.covariates import asked_columns
@@ -157,7 +158,8 @@ class Simulated:
         covariates: by name, `s` each [SI].
         injected: the effects that act on the machine.
         outliers: numbers of the bad rows, from 0.
-        gap: root of the mean square of the position's error by all effects, without noise and bad rows [m].
+        gap: root of the mean square of the position's error by all effects, without noise and bad rows [m]; where the
+            machine only turns, of the rotation's [rad].
     """
 
     mechanism: Mechanism
@@ -280,7 +282,9 @@ def _injected(situation: Situation, acting: Acting, nominal: Tensor) -> Injected
 
 
 def _rms(change: Tensor) -> float:
-    return float(change[..., :3].square().sum(-1).mean().sqrt())
+    position, rotation = change[..., :3], change[..., 3:]
+    told = position if bool(position.any()) or not rotation.shape[-1] else rotation
+    return float(told.square().sum(-1).mean().sqrt())
 
 
 def _moved(frame: Tensor, change: Tensor, turns: bool) -> Tensor:
@@ -320,18 +324,19 @@ def injected_table(simulated: Simulated) -> Table:
         for one in simulated.injected
         for name, (value, unit) in one.parameters.items()
     ]
-    parts = []
+    parts, turns = [], only_turns(simulated.mechanism.frame(simulated.pose))
+    what, unit = ("rotation", "µrad") if turns else ("position", "µm")
     effects = [one for one in simulated.injected if one.name != OUTLIER]
     if effects:
-        alone = "; ".join(f"{one.name} alone {one.gap * 1e6:.3g} µm" for one in effects)
+        alone = "; ".join(f"{one.name} alone {one.gap * 1e6:.3g} {unit}" for one in effects)
         without = "noise and bad rows" if simulated.outliers else "noise"
         parts.append(
-            f"RMS error of the position {simulated.gap * 1e6:.3g} µm over all rows without {without} ({alone})"
+            f"RMS error of the {what} {simulated.gap * 1e6:.3g} {unit} over all rows without {without} ({alone})"
         )
     if simulated.outliers:
         # As the file will have them, below a header.
         lines = np.arange(len(simulated.joints), dtype=np.int64) + 2
         added = sum(one.gap**2 for one in simulated.injected if one.name == OUTLIER) ** 0.5
         named = name_lines(lines, simulated.outliers, len(simulated.outliers))
-        parts.append(f"RMS error by bad rows {added * 1e6:.3g} µm over all rows; bad rows: {named}")
+        parts.append(f"RMS error by bad rows {added * 1e6:.3g} {unit} over all rows; bad rows: {named}")
     return Table("Injected", ("effect", "parameter", "value", "unit"), tuple(rows), "; ".join(parts))

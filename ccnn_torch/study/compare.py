@@ -32,11 +32,14 @@ def runs_table(runs: Mapping[str, RunResults]) -> Table:
     Runs are marked by a letter for the rows that they were judged on: only those of one letter are comparable.
     """
     marks = _marks(runs)
-    largest = max(results.pose.position.before.rms.median or 0.0 for results in runs.values())
-    scale, unit = display_unit("m", largest)
+    # Of runs of machines that only turn the angles are told.
+    turns = all(results.pose.told[0] == "rotation" for results in runs.values())
+    kind = "rotation" if turns else "position"
+    largest = max(results.pose[kind].before.rms.median or 0.0 for results in runs.values())
+    scale, unit = display_unit("rad" if turns else "m", largest)
     rows = []
     for folder, results in runs.items():
-        best, position, counts = results.best_method, results.pose.position, results.rows
+        best, error, counts = results.best_method, results.pose[kind], results.rows
         block = results.methods.get(best or "") or Method(test=None)
         rows.append(
             (
@@ -44,13 +47,13 @@ def runs_table(runs: Mapping[str, RunResults]) -> Table:
                 marks[folder],
                 f"{counts.train + counts.validation} + {counts.test}",
                 _method_text(results),
-                *(interval_text(position[when].rms, scale, 3) for when in ("before", "after")),
+                *(interval_text(error[when].rms, scale, 3) for when in ("before", "after")),
                 interval_text(block.ratio_to_floor, digits=3),
                 interval_text(block.seconds, digits=3),
             )
         )
     columns = ("run", "test rows", "rows", "method", f"before [{unit}]", f"after [{unit}]", "to floor", "time [s]")
-    note = "Before and after: RMS position error on the test rows. Rows: trained on + tested on."
+    note = f"Before and after: RMS {kind} error on the test rows. Rows: trained on + tested on."
     if len(set(marks.values())) > 1:
         note += " Runs with different letters were judged on different test rows: their figures are not comparable."
     return Table("Runs", columns, rows, note, words=("test rows", "method"), details=("rows",))

@@ -337,11 +337,14 @@ def verify_model(
             c.name: JointError(unit=c.unit, before=rms_of(measured[usable, k]), after=rms_of(left[usable, k]))
             for k, c in enumerate(machine.joints)
         },
-        # Without a promise the position error has to fall at 95 %.
-        kept=all(kept) if limited else paired_gain(before.position, after.position, groups),
+        kept=all(kept),
         notes=[],
         text="",
     )
+    if not limited:
+        # The first error has to fall at 95 %.
+        first, last = (getattr(error, results.kinds[0]) for error in (before, after))
+        results.kept = paired_gain(first, last, groups)
     results.notes += loaded.missing
     if results.outside_domain:
         results.notes.append(
@@ -359,7 +362,8 @@ def verify_model(
 def _moved(rows: Rows, results: VerifyResults) -> list[str]:
     """A sentence if a moved measuring frame explains at least half of the remaining error."""
     whole = ~rows.pose.isnan().any(-1)
-    if results.kept or not can_be_moved(rows.mechanism) or min(results.configurations, int(whole.sum())) < 4:
+    few = min(results.configurations, int(whole.sum())) < 4
+    if results.kept or few or "position" not in results.kinds or not can_be_moved(rows.mechanism):
         return []
     at = rows.nominal if results.compensated else rows.predicted
     motion = fit_motion(rows.mechanism, at, rows.pose)

@@ -138,12 +138,9 @@ def write_verify_report(folder: Path, results: VerifyResults, arrays: RunArrays)
     return [folder / "verify.json", folder / "verify.html"]
 
 
-_KINDS = ("position", "rotation")
-
-
 def verify_text(results: VerifyResults) -> str:
     """The verdict in one or two sentences."""
-    blocks = {kind: results[kind] for kind in _KINDS if results[kind] is not None}
+    blocks = {kind: results[kind] for kind in results.kinds}
     promised = {kind: block for kind, block in blocks.items() if block.promised is not None}
     rows = count_text(results.rows, "row")
     how = "measured with the model in use" if results.compensated else "measured without compensation"
@@ -151,7 +148,8 @@ def verify_text(results: VerifyResults) -> str:
     if not promised:
         verdict = "is lower" if results.kept else "is not lower"
         return (
-            f"The model promises no figure; on {rows} {how} the position error {verdict} than before at 95 %: {left}."
+            f"The model promises no figure; on {rows} {how} the {results.kinds[0]} error {verdict} than before at "
+            f"95 %: {left}."
         )
     broken = [kind for kind, block in promised.items() if block.after.rms > block.promised.high]
     limits = " and ".join(_limit(block, block.promised, kind) for kind, block in promised.items())
@@ -164,10 +162,8 @@ def verify_text(results: VerifyResults) -> str:
 def verify_tables(results: VerifyResults) -> list[Table]:
     """Pose error against the promise, and the deviation of each joint."""
     rows = []
-    for kind in _KINDS:
+    for kind in results.kinds:
         block = results[kind]
-        if block is None:
-            continue
         scale, unit = display_unit(block.unit, block.before.rms)
         for when in ("before", "after"):
             cells = [number_text(block[when][measure] / scale) for measure in ("rms", "max")]

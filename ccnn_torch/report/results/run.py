@@ -146,6 +146,13 @@ class Pose(Result):
     """position error plus weighted rotation error"""
 
     @property
+    def told(self) -> tuple[str, PoseFigures]:
+        """The error that a sentence tells, with its name: of the position, or of rotation where nothing else moves."""
+        if self.rotation is not None and not self.position.before.rms.median:
+            return "rotation", self.rotation
+        return "position", self.position
+
+    @property
     def parts(self) -> list[str]:
         """What of the compensator was not learned."""
         return [part for part in ("geometry", "effects") if self.position[part] is not None]

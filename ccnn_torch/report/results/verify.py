@@ -150,3 +150,10 @@ class VerifyResults(Result):
     kept: bool
     notes: list[str]
     text: str
+
+    @property
+    def kinds(self) -> list[Literal["position", "rotation"]]:
+        """Which errors there are: of a machine that only turns, none of the position."""
+        if self.rotation is None:
+            return ["position"]
+        return ["position", "rotation"] if self.position.before.rms else ["rotation"]
