@@ -119,7 +119,7 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
 
     At the true values with the true noise the standard errors are the Cramér-Rao bound. No pseudoinverse: along a
     direction that the rows do not see the uncertainty is infinite, and so is that of every parameter that takes part
-    in it. A direction whose standard error would be above 100 plausible errors counts as not seen.
+    in it. A direction whose standard error would be above 30 plausible errors counts as not seen.
     A parameter takes part in a direction if one plausible error along it moves the parameter by more than a hundredth
     of its own; one that is moved by less keeps a finite error, with that movement in it.
 

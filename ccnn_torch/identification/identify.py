@@ -225,7 +225,9 @@ def write_outputs(found: Identification, folder: Path) -> None:
     joints = torch.cat([measured.rows.joints[0], measured.test.joints[0]])
     ends = torch.stack([joints.amin(0), joints.amax(0)], -1).tolist()
     maps = config.columns, config.joint_map, {j.name: pair for j, pair in zip(machine.joints, ends, strict=False)}
-    write_machine(machine, found.nominal(), folder, "identified", *maps)
+    if bool(next(iter(found.outcomes.values())).converged[0]):
+        # A machine at the values where a search stopped is none that commands may come from.
+        write_machine(machine, found.nominal(), folder, "identified", *maps)
     if found.config.save_report:
         write_identified_report(folder, results)
     write_json(folder / RESULTS, IdentifiedResults.model_validate(results))
@@ -253,7 +255,7 @@ def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, de
     if found.results["methods"][found.results["method"]]["converged"] == 0:
         why = " ".join([not_settled(found.results), *found.results["doubts"]])
         raise MethodFailedError(
-            f"{why} What was written to {path} is there to look into it, not to use; more rows, "
+            f"{why} What was written to {path} is there to look into it; no machine file is. More rows, "
             "more starts (starts=10) or fewer free parameters may help"
         )
 

@@ -108,6 +108,7 @@ def test_a_search_that_did_not_converge_identifies_nothing(tmp_path: Path, capsy
     assert text.split("\n\n")[1].startswith("lm did not converge, so nothing is identified")
     assert "brings" not in text and "95 %" not in text
     assert "lm did not converge" in capsys.readouterr().out.replace("\n", " ")
+    assert not (tmp_path / "out" / "identified.yaml").exists(), "commands could come from it"
 
 
 def test_some_machines_that_did_not_converge_are_named_first() -> None:

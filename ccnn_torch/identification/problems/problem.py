@@ -111,9 +111,9 @@ class Solver(Protocol):
         ...
 
 
-# A direction in which the rows leave more than so many plausible errors open (0.1 m, 0.2 rad) counts as unseen: what a
+# A direction in which the rows leave more than so many plausible errors open (30 mm, 60 mrad) counts as unseen: what a
 # linearised problem is not valid so far away.
-OPEN = 100.0
+OPEN = 30.0
 
 
 def row_jacobian(

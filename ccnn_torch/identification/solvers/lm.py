@@ -88,7 +88,7 @@ def solve_lm(
 
     The step solves (JᵀJ + prior + λ max diag(JᵀJ) I) du = -gradient, u being the values in plausible errors. A
     direction that the rows do not see stays where it was, and so does one that they see so faintly that the noise
-    would move it by 100 plausible errors. A trial that is worse, or not finite (out of reach), is
+    would move it by 30 plausible errors. A trial that is worse, or not finite (out of reach), is
     refused and λ grows.
 
     Args:
