@@ -25,7 +25,7 @@ from ccnn_torch.diagnosis.from_records import in_own_base, named_mistake, situat
 from ccnn_torch.diagnosis.joint_fit import effects_that_pay, fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.diagnosis.residual.linearisation import remainder
 from ccnn_torch.diagnosis.residual.rows import picked
-from ccnn_torch.display import short_path
+from ccnn_torch.display import short_path, with_unit
 from ccnn_torch.effects import (
     Acting,
     Effect,
@@ -285,7 +285,13 @@ def frames_of_repeats(mechanism: Mechanism, records: Records, splits: list[Split
         except InputError as reason:
             raise named_mistake(reason, mechanism, records, parameters[0].squeeze(0)) from None
     unknown = " and ".join(getattr(mechanism, "unknown_frames", ()))
-    notes.append(f"Frames fitted first, on the training rows of each repeat: {unknown}.")
+    moved = (parameters[0].reshape(-1, parameters.shape[-1])[0] - mechanism.nominal).tolist()
+    values = [f"{p.name} {with_unit(v, p.unit)}" for p, v in zip(mechanism.geometry, moved, strict=True) if v]
+    notes.append(
+        f"Frames fitted first, on the training rows of each repeat: {unknown} ({', '.join(values) or 'as given'}). "
+        "Poses are wanted as these frames show them: errors of the machine that look like theirs, such as zeros of "
+        "joints, are not corrected."
+    )
     return parameters, notes
 
 
