@@ -26,6 +26,42 @@ import numpy as np
 
 from ccnn_validation.workshop_machines import Arm, Case, Rails
 
+
+class Strange(Case):
+    """Further causes that we believe no library names."""
+
+    def brake(self) -> None:
+        """In two of five rows the reading came so late that joint 2 hung on its brake; nobody wrote down which."""
+        torque = self.m.weight_torque(self.q)[:, 1]
+        self.dq[:, 1] += 1.6e-4 * torque / np.abs(torque).max() * (self.rng.random(self.n) < 0.4)
+
+    def warm_gear(self) -> None:
+        """Backlash of joint 1 and 4 that closes as grease and gears warm up."""
+        shrink = 0.25 + 0.75 * np.exp(-self.time / (0.3 * self.time[-1]))
+        self.dq[:, [0, 3]] -= np.array([2.2e-4, 3e-4]) * shrink[:, None] * self.direction[:, [0, 3]]
+
+    def late_payload(self) -> None:
+        """Payloads were noted two rows after they were changed, since the note was made when the arm stood still."""
+        self.compliance()
+        key = "payload[kg]"
+        self.wrong = lambda made: made | {key: np.concatenate([made[key][:1], made[key][:1], made[key][:-2]])}
+
+    def coolant(self) -> None:
+        """Coolant is switched on midway and off again: the rod of leg 3 shrinks, and no thermometer is near."""
+        s = self.time / self.time[-1]
+        on = np.where(s > 0.4, 1 - np.exp(-(s - 0.4).clip(0) / 0.05), 0) - np.where(
+            s > 0.75, 1 - np.exp(-(s - 0.75).clip(0) / 0.05), 0
+        )
+        self.dim("rod", -6e-5 * on[:, None] * np.eye(3)[2])
+
+    def twisted(self) -> None:
+        """Two rods of leg 1 differ by 60 um: platform and reflector turn by another angle at each place."""
+        p = self.m.reach(self.q, {})
+        across = (p[:, 1] + 0.4) / 0.9
+        turn = 6e-5 / 0.1 * (1 + 1.2 * across) / np.sqrt(1 - across**2)
+        self.moved += turn[:, None] * np.array([-0.05, 0.08, 0.0])
+
+
 # --- the cases: machine, rows, causes; told: the noise stands in the config; no: columns left out or wrong
 SAME = {
     "joint_offset": ["joint_offset", "geometry"],
@@ -33,6 +69,11 @@ SAME = {
     "compliance": ["compliance", "bending"],
     "instrument": ["instrument", "geometry", "joint_gain"],
     "fahrenheit": ["thermal"],
+    "warm_gear": ["backlash", "friction"],
+    "late_payload": ["compliance", "bending"],
+    "twisted": ["geometry"],
+    "brake": [],
+    "coolant": [],
     "swapped": ["backlash"],
     "stick_slip": ["frame_drift"],
     "encoder_swap": ["transmission", "homing"],
@@ -57,9 +98,13 @@ CASES_OF = {
     "withheld": """
         rails 160 thermal told no:temperature; rails 120 backlash no:direction; arm 140 compliance told no:payload;
         arm 140 friction told no:direction""",
+    "strange": """
+        arm 140 brake told; arm 200 warm_gear; arm 150 late_payload told no:payload; rails 180 coolant;
+        rails 160 twisted told""",
 }
 CASES = [(kind, case.split()) for kind, cases in CASES_OF.items() for case in cases.split(";")]
 CAUTION = {
+    "late_payload": r"load|payload",
     "fahrenheit": r"temperature",
     "swapped": r"exchang|swap|direction1.*direction2",
     "sorted_rows": r"order|sorted",
@@ -74,8 +119,8 @@ def written(folder: Path, seed: int, number: int) -> dict[str, Any]:
     rng = np.random.default_rng([seed, number])
     if seed:
         rows, told = int(np.clip(rows * rng.uniform(0.6, 1.3), 60, 300)), told ^ bool(seed % 2)
-    c = Case(m, rng, rows)
-    if left == "payload" or "compliance" in causes or kind == "nothing":
+    c = Strange(m, rng, rows)
+    if left == "payload" or "compliance" in causes or causes == "late_payload" or kind == "nothing":
         c.weights()
     if m.joints == 6:
         c.jitter = 8e-6
@@ -113,7 +158,7 @@ def written(folder: Path, seed: int, number: int) -> dict[str, Any]:
 
 def judged(truth: dict[str, Any], found: dict[str, Any]) -> tuple[str, str, list[str]]:
     """Mark, what was told, and names that are wrong."""
-    verdict, kind = found["verdict"], truth["kind"]
+    verdict, kind = found["verdict"], truth["kind"].replace("strange", "outside")
     alike = {e["name"]: e["indistinguishable_from"] for e in found["effects"]}
     classes = [[name, *alike.get(name, [])] for name in verdict["effects"] if name != "outlier"]
     outside, text = bool(verdict["outside_library"]), " ".join(map(str, found["cautions"]))
@@ -152,6 +197,8 @@ def judged(truth: dict[str, Any], found: dict[str, Any]) -> tuple[str, str, list
             mark = "wrong" if wrong and not outside else "right" if not wrong and (hits or asked) else "partly"
     if mark == "wrong" and kind in ("outside", "withheld") and verdict["probability"] < 0.6:
         mark = "partly"
+    if mark == "wrong" and kind == "outside" and verdict["none"] and found["noise"] == "estimated":
+        mark = "partly"  # it says that the noise may hold a cause
     if mark == "wrong" and truth["left_out"] and truth["left_out"] in text:  # a caution asks for the very column
         mark = "partly"
     return mark, told, wrong
