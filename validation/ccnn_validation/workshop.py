@@ -1,15 +1,16 @@
 """Does `ccnn diagnose` name what is wrong with two machines of a workshop, from files as a workshop writes them?
 
-`python -W ignore -m ccnn_validation.workshop --seed N --out DIR [--only NAME,NAME] [--dry]`. Two machines that share no
-code with ours: `rails`, three carriages on parallel rails that carry a platform by rods of equal length (the user's own
-class), and `arm`, a six-axis arm by its DH table; a levelled laser tracker at an unknown place reads x, y, z of a
-reflector. Some forty cases, each 60 to 300 rows: single causes of the library in another form than the simplest one, pairs
-of them, causes that no library has, nothing but noise of several laws, and causes whose column was not recorded. The
-truth of all cases is written (`truth.json`) before the first is diagnosed; a folder of a case has its files, the screen
-and `diagnosis.json`. A case that has been diagnosed is not diagnosed again.
+`python -W ignore -m ccnn_validation.workshop --seed N --out DIR [--only "CAUSES;CAUSES"] [--dry]`. Two machines that
+share no code with ours: `rails`, three carriages on parallel rails that carry a platform by rods (the user's own class),
+and `arm`, a six-axis arm by its DH table; a levelled laser tracker at an unknown place reads x, y, z of a reflector.
+47 cases, each 60 to 300 rows: single causes of the library in another form than the simplest one, pairs of them, causes
+that no library has, nothing but noise of several laws, and causes whose column was not recorded. Odd seeds tell the
+noise where even ones do not. The truth of all cases is written (`truth.json`) before the first is diagnosed; the folder
+of a case has its files, the screen and `diagnosis.json`. A case that has been diagnosed is not diagnosed again.
 
 right: the names are the true causes and no others, a name of its class counting as the name; for a cause outside the
-library: told as outside, or its caution given, without a wrong name; for nothing: none. partly: some of it. Else wrong.
+library: told as outside, or its caution given, without a wrong name; for nothing: none; for a column that was not
+recorded: no wrong name, and the column asked for. partly: some of it, or a doubt that is stated. Else wrong.
 """
 
 from __future__ import annotations
@@ -209,7 +210,7 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--seed", type=int, required=True)
     options.add_argument("--out", type=Path, required=True)
-    options.add_argument("--only", default="", help="causes of cases, between commas")
+    options.add_argument("--only", default="", help="causes of cases, between semicolons")
     options.add_argument("--dry", action="store_true", help="write the cases and their truth alone")
     given = options.parse_args()
     name = "{:02d}_{}_{}".format
