@@ -1,7 +1,7 @@
 """Does `ccnn diagnose` name what is wrong with two machines of a workshop, from files as a workshop writes them?
 
 `python -W ignore -m ccnn_validation.workshop --seed N --out DIR [--only "CAUSES;CAUSES"] [--dry]`. Two machines that
-share no code with ours: `rails`, three carriages on parallel rails that carry a platform by rods (the user's own class),
+share no code with ours: `rails`, three carriages on parallel rails and a platform on rods (the user's own class),
 and `arm`, a six-axis arm by its DH table; a levelled laser tracker at an unknown place reads x, y, z of a reflector.
 47 cases, each 60 to 300 rows: single causes of the library in another form than the simplest one, pairs of them, causes
 that no library has, nothing but noise of several laws, and causes whose column was not recorded. Odd seeds tell the
