@@ -44,6 +44,17 @@ POINT, RATIO, G = np.array([0.2, 0.1, -0.15]), np.array([153.0, 171.0, 185.0, 81
 MASS, C3, CW, SPRING = np.array([90.0, 60.0, 25.0, 45.0]), 0.35, 0.12, (-0.3 - 0.1j, 0.35)
 LOW, HIGH = np.radians([-100.0, 50.0, -50.0, -170.0]), np.radians([100.0, 120.0, 15.0, 170.0])
 LOADS, NEW, IRON, ALUMINIUM = np.array([0.0, 60.0]), 400, 11.5e-6, 23e-6
+WHERE = "{mechanism: framed, keys: {mechanism: palletizer_arm.py:Palletizer, base: true, allow_code: true%s}, "
+RATIOS = ", keys: {gears: [153, 171, 185, 81]%s}"
+OWN = "mechanism: palletizer_arm.py:Palletizer\nmechanism_keys: {stand: true, allow_code: true%s}\n"
+SEEN = f"mechanism: instrument\nmechanism_keys: {WHERE}kind: pose, pose: [x, y, z]}}\n"
+# Of ours: config. `SEEN` fits the tracker's frame; `OWN` has rows in a frame that was fitted to the drawing before.
+OURS = {
+    "ideal": OWN % "",
+    "bars": OWN % ", bars: true",
+    "seen, ideal": SEEN % (RATIOS % ""),
+    "seen, bars": SEEN % (RATIOS % ", bars: true"),
+}
 CAUSES = ("lengths", "bars", "zeros", "leans", "sag", "spring", "rods", "base", "gears", "turns", "play", "warmth")
 
 
@@ -196,7 +207,12 @@ def day(robot: Robot, rows: int, rng: np.random.Generator) -> tuple[Array, Array
 def missed(joints: Array, reached: Array) -> tuple[float, float]:
     """Root mean square and maximum of a miss [m] in the best frame, with the best point on the flange of the drawing."""
     at, frame = drawn(joints)
+    if np.isnan(reached).any():
+        return np.nan, np.nan
     near, _ = Rotation.align_vectors(at - at.mean(0), reached - reached.mean(0))
+
+    if np.isnan(reached).any():
+        return np.nan, np.nan
 
     def off(x: Array) -> Array:
         moved = Rotation.from_rotvec(x[:3]).apply(near.apply(reached)) + x[3:6]
@@ -322,6 +338,13 @@ def by_process(joints: Array, told: Array, left: Array, wanted: Array, then: Arr
     return np.stack([make(kernel, normalize_y=True, random_state=0).fit(rows, one).predict(new) for one in left.T], -1)
 
 
+def table(joints: Array, told: Array, seen: Array) -> tuple[str, Array]:
+    """Header and rows of a file; `seen` has no columns where nothing was measured."""
+    names = [f"q{k}[deg]" for k in (1, 2, 3, 4)] + [f"temperature_motor{k}[degC]" for k in (1, 2, 3, 4)]
+    names += [f"direction{k}[1]" for k in (1, 2, 3, 4)] + ["payload[kg]", "x[mm]", "y[mm]", "z[mm]"]
+    return ",".join(names[: 13 + seen.shape[1]]), np.c_[np.degrees(joints), told, 1e3 * seen]
+
+
 def judged(seed: int, rows: int, without: tuple[str, ...], names: list[str], kept: Path | None) -> dict[str, tuple]:
     """Root mean square and maximum of what one machine misses [m], by who calibrated it."""
     robot, rng = Robot(seed, without), np.random.default_rng([seed, 1])
@@ -335,7 +358,20 @@ def judged(seed: int, rows: int, without: tuple[str, ...], names: list[str], kep
         more = by_process(joints, told, script.left, wanted, then)
         sent[f"{who} and process"] = script.commands(wanted, then, more)
         print(f"  {who}: leaves {1e6 * np.sqrt((script.left**2).sum(1).mean()):.0f} um", file=sys.stderr)
-    return {who: missed(wanted, robot.reached(q, then, warm)) for who, q in sent.items()}
+    text = (Path(__file__).parent / "palletizer_arm.py").read_text()
+    for name in names:
+        own = "instrument" not in OURS[name]
+        fitted = script.turn.inv().apply(seen - script.stand) if own else seen
+        records, targets = table(joints, told, fitted), table(wanted, then, np.empty((NEW, 0)))
+        with TemporaryDirectory() as folder:
+            place = Path(folder) if kept is None else kept / f"{seed}_{name}".replace(", ", "_").replace(" ", "_")
+            place.mkdir(parents=True, exist_ok=True)
+            file = "palletizer_arm.py"
+            found = commanded(place, text, records, targets, "run", OURS[name], file, "--allow-code")
+        sent[f"ours, {name}"] = np.full_like(wanted, np.nan) if found is None else found
+    none = np.full((NEW, 3), np.nan)
+    went = {who: none if np.isnan(q).any() else robot.reached(q, then, warm) for who, q in sent.items()}
+    return {who: missed(wanted, places) for who, places in went.items()}
 
 
 if __name__ == "__main__":
@@ -344,7 +380,7 @@ if __name__ == "__main__":
     options.add_argument("--machines", type=int, default=1)
     options.add_argument("--rows", type=int, default=80)
     options.add_argument("--without", nargs="*", choices=CAUSES, default=[])
-    options.add_argument("--ours", nargs="*", default=[])
+    options.add_argument("--ours", nargs="*", choices=list(OURS), default=list(OURS))
     options.add_argument("--keep", type=Path)
     asked = options.parse_args()
     for number in range(asked.seed, asked.seed + asked.machines):
