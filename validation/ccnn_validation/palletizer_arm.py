@@ -32,7 +32,8 @@ def closed(pivot: Tensor, link: Tensor, far: Tensor, rod: Tensor, side: float) -
 
 def product(a: Tensor, b: Tensor) -> Tensor:
     """Two turns in a plane behind each other, each a cosine and a sine."""
-    return torch.stack([a[..., 0] * b[..., 0] - a[..., 1] * b[..., 1], a[..., 0] * b[..., 1] + a[..., 1] * b[..., 0]], -1)
+    (c, s), (d, t) = a.unbind(-1), b.unbind(-1)
+    return torch.stack([c * d - s * t, c * t + s * d], -1)
 
 
 class Palletizer(Mechanism):
