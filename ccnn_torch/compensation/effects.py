@@ -30,6 +30,8 @@ _NAMES = (
     "pose",
     "platform",
 )
+# Change of a joint or pose from which on it is none of a machine, but of one that has no such pose [m, rad].
+_MOST = 0.5
 # Error of a pose from which Newton's method comes to the right one, as a share of the largest.
 _START = 0.1
 # Parts of `platform`.
@@ -251,6 +253,8 @@ class PhysicalEffects(nn.Module):
     def changes(self, joints: Tensor, covariates: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """What the effects add to joints `... x n` and to position and rotation vector `... x c` [SI]; None for none.
 
+        Where the machine has no pose, its derivatives are out of all proportion, and they add 0.
+
         Args:
             joints: commanded, `... x n` [SI].
             covariates: `... x m` [SI].
@@ -259,6 +263,11 @@ class PhysicalEffects(nn.Module):
         for one in self.acting:
             change, kind = one.change(here), one.effect.kind
             found[kind] = found[kind] + change if kind in found else change
+        # A comparison with NaN is false.
+        found = {
+            kind: torch.where(change.abs().amax(-1, keepdim=True) <= _MOST, change, torch.zeros_like(change))
+            for kind, change in found.items()
+        }
         moved, shift = (found.get(kind) for kind in ("joints", "pose"))
         lead = joints.shape[:-1]
         return (

@@ -150,12 +150,12 @@ class Thermal(Effect):
     θ is the temperature less 20 degC, as a body of one heat capacity follows it with a lag: θ' = (T - θ) / lag, settled
     at the first row. Without a column of times there is no lag. Secondary: mounts that move a joint by γ_i θ; a
     reference that was not 20 degC (a constant growth); beams that bend by what the surroundings are ahead of the body,
-    T - θ; parts of the growth that follow at once, or with a lag of their own (a core in its skin); and the drives' own
-    warmth, which no thermometer in the hall sees: growth of all and of the sliding drives by 1 - exp(-t / 2000 s). By
-    each further thermometer, `temperature_NAME`, growth of all these parts by what it shows beyond the first one, and
-    of drives and mounts by what it shows itself, each there or not for itself: a leg, or a screw, grows by its own
-    thermometer. Lengths that every leg has one of may grow together, as a base plate does. Without `temperature` the
-    mean of the others stands for it.
+    T - θ; parts of the growth that follow at once, or with a second lag, of members and drives as well (a core in its
+    skin, screws behind thin rods); and the drives' own warmth, which no thermometer in the hall sees: growth of all and
+    of the sliding drives by 1 - exp(-t / 2000 s). By each further thermometer, `temperature_NAME`, growth of all these
+    parts by what it shows beyond the first one, and of drives and mounts by what it shows itself, each there or not for
+    itself: a leg, or a screw, grows by its own thermometer. Lengths that every leg has one of may grow together, as a
+    base plate does. Without `temperature` the mean of the others stands for it.
 
     Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
     derivatives, so the effect is one on the pose: no joint has to replace a length (near a singularity of an arm
@@ -184,16 +184,17 @@ class Thermal(Effect):
             for j in mechanism.joints
             if j.unit == "m"
         ]
+        low, high = situation.workspace
         drives += [
-            Coefficient(f"{j.name} mount", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
-            for j in mechanism.joints
+            Coefficient(f"{j.name} mount", f"{j.unit}/K", _mount(j.unit, reach), joint=j.name, secondary=True)
+            for j, reach in zip(mechanism.joints, (high - low).tolist(), strict=True)
         ]
         found += drives
         found.append(Coefficient("reference", "1", _STEEL * _REFERENCE_OFF, secondary=True))
         if "time" in situation.covariates:
             own = _STEEL * _OWN_WARMTH
             found.append(Coefficient("at once", "1/K", uneven, secondary=True))
-            found.append(Coefficient("late", "1/K", uneven, secondary=True))
+            found += [replace(c, name=_late(c), secondary=True, positive=False) for c in (*following, *drives)]
             found += [
                 Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
                 for j in mechanism.joints
@@ -225,12 +226,9 @@ class Thermal(Effect):
         whole = max(float(elapsed(situation.covariates["time"]).max()), 1e-6)
         low, high = (math.log(share * whole) for share in _WARM_SHARES)
         lags = [math.exp(low + (high - low) * k / (_LAGS - 1)) for k in range(_LAGS)]
-        late = [c.name for c in self.coefficients(situation)].index("late")
-        every = range(len(self.coefficients(situation)))
-        return (
-            Shape("lag", "s", (0.0, *lags), tuple(k for k in every if k != late)),
-            Shape("late lag", "s", tuple(lags), (late,)),
-        )
+        late = [c.name.endswith("late") for c in self.coefficients(situation)]
+        first, second = (tuple(k for k, last in enumerate(late) if last == which) for which in (False, True))
+        return Shape("lag", "s", (0.0, *lags), first), Shape("late lag", "s", tuple(lags), second)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
@@ -248,7 +246,7 @@ class Thermal(Effect):
         apart = [longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism)]
         travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
         following = [whole, *apart, travel]
-        timed = [whole, whole, jacobian, *following] if _timed(situation) else []
+        timed = [whole, *following, jacobian, jacobian, *following] if _timed(situation) else []
         bodies = [longer[..., p.lengths].sum(-1, keepdim=True) for p in like_parts(mechanism)]
         others = [whole, *apart, *bodies, travel, jacobian] * len(situation.thermometers)
         return torch.cat([*following, jacobian, whole, *timed, *bodies, *others], -1)
@@ -266,7 +264,7 @@ class Thermal(Effect):
             time = situation.covariates["time"]
             body, core = (lagged(time, warm, shape[..., k]) for k in (0, 1))
             own = -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
-            kinds += [(warm, 1), (core, 1), (warm - body, n), (own, following)]
+            kinds += [(warm, 1), (core, following + n), (warm - body, n), (own, following)]
             others = [lagged(time, other, shape[..., 0]) for other in others]
         kinds = [(body, following + n), *kinds, (body, bodies)]
         for other in others:
@@ -274,6 +272,15 @@ class Thermal(Effect):
             kinds += [(other - body, following - sliding + bodies), (other, sliding + n)]
         each = torch.stack(torch.broadcast_tensors(*(k for k, _ in kinds)), -1)  # type: ignore[no-untyped-call]
         return each[..., [i for i, (_, count) in enumerate(kinds) for _ in range(count)]]
+
+
+def _mount(unit: str, reach: float) -> float:
+    """Plausible size [SI/K]; a sliding drive is held at either end of its reach, a turning one moves on its mount."""
+    return max(_MOUNT[unit], _STEEL * reach) if unit == "m" else _MOUNT[unit]
+
+
+def _late(coefficient: Coefficient) -> str:
+    return "late" if coefficient.name == "growth" else f"{coefficient.name} late"
 
 
 def _timed(situation: Situation) -> bool:

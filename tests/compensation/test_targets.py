@@ -26,13 +26,14 @@ from torch import Tensor
 from ccnn_torch import export_model
 from ccnn_torch.compensation import Compensator
 from ccnn_torch.compensation.model_files.identified import load_geometry
-from ccnn_torch.compensation.model_files.metadata import open_onnx
+from ccnn_torch.compensation.model_files.metadata import open_onnx, run_onnx
 from ccnn_torch.compensation.targets import from_model
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of, traced_program
 from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal, run_form, run_program
 from ccnn_torch.compensation.targets.onnx_export import export_float32
+from ccnn_torch.compensation.targets.onnx_graph import Graph
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import load_mechanism
@@ -349,3 +350,19 @@ def test_identified_geometry_alone(error: float, tmp_path: Path) -> None:
         return
     files = export_model(path, "c99", tmp_path / "out")
     assert "five_bar" in files["compensator.h"].read_text()
+
+
+@pytest.mark.parametrize("near", [1 + 3e-8, 1 - 2e-8])
+def test_a_factor_that_single_precision_takes_for_one_is_kept(near: float) -> None:
+    """As the cosine of an identified lean: ONNX Runtime leaves out a product with what it takes for 1."""
+    graph = Graph(2, 17)
+    joints = graph.input("joints", 3, "batch")
+    sine, constant = graph.node("Sin", [joints.name], joints.shape, joints.real).name, graph.constant(np.float64(near))
+    pairs = {"times": ("Mul", [sine, constant]), "over": ("Div", [sine, constant]), "under": ("Div", [constant, sine])}
+    made = {name: graph.node(*what, joints.shape, joints.real).name for name, what in pairs.items()}
+    ends = {name: graph.node("Cos", [one], joints.shape, joints.real) for name, one in made.items()}
+    session = open_onnx(graph.model(ends, "batch", "near").SerializeToString())
+    rows = np.array([[0.3, 1.0, 2.0]])
+    found, wanted = run_onnx(session, rows, None), np.sin(rows)
+    for name, value in {"times": wanted * near, "over": wanted / near, "under": near / wanted}.items():
+        assert np.abs(found[name] - np.cos(value)).max() < 1e-14

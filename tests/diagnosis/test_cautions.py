@@ -147,6 +147,33 @@ def test_a_temperature_of_no_workshop_is_doubted() -> None:
     assert "check the unit of its column" in found.cautions[0]
 
 
+def test_a_temperature_in_degf_is_found_out() -> None:
+    """As degC it says that the machine hardly grows, and that something else follows the time."""
+    rows = rows_of("delta_linear", 120, 7)
+    hall = 293.15 + 4 * torch.sin(torch.linspace(0, 5, 120, dtype=torch.float64))
+    situation = replace(rows, covariates=dict(rows.covariates) | {"temperature": hall})
+    pose = reached_with(situation, [acting(situation, "thermal", growth=1.2e-5, q1_mount=6e-6)], 8)
+    columns = dict(situation.covariates) | {"temperature": 273.15 + 32 + 1.8 * (hall - 273.15)}
+    found = diagnose_rows(replace(situation, covariates=columns), pose, effects=[*FEW, "thermal", "frame_drift"])
+    assert found.verdict["probability"] <= 0.9
+    assert any("check the unit of its column, degC, degF or K" in caution for caution in found.cautions)
+    said, corrected = next(cautions._corrections(replace(situation, covariates=columns), ["temperature"]))
+    assert said == "temperature seems to be in degF" and torch.allclose(corrected["temperature"], hall)
+
+
+def test_a_number_below_zero_that_another_makes_up_for_is_no_doubt() -> None:
+    """The torques of all links and of the inner ones look alike: what the joint does in all goes with its weight."""
+    links = [[0.0, math.pi / 2, 0.4, 0.0], [0.7, 0.0, 0.0, 0.0], [0.6, 0.0, 0.0, 0.0]]
+    arm = SerialArm("three", "standard", links)
+    joints = arm.sample_joints(150, torch.Generator().manual_seed(9))
+    situation = Situation(arm, joints, {}, default_gravity(arm))
+    both = acting(situation, "gravity", q2=-2e-3, q2_inner_links=6e-3)
+    effects = ["geometry", "joint_offset", "joint_gain", "transmission", "gravity"]
+    found = diagnose_rows(situation, reached_with(situation, [both], 10), effects=effects)
+    assert found.verdict["effects"] == ["gravity"]
+    assert not any("would have to be negative" in caution for caution in found.cautions)
+
+
 def test_noise_that_hides_everything_is_doubted() -> None:
     situation = rows_of("five_bar", 90, 9)
     pose = measured(situation, {"joint_offset": 5.0}, 10)

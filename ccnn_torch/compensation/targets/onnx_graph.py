@@ -20,6 +20,8 @@ from torch import Tensor
 
 # A matrix with more elements is not multiplied with another one when the graph is written.
 _LARGEST = 200_000
+# What is nearer to 1 is 1 in single precision.
+_SINGLE = 2.0**-24
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ class Graph:
         self._inputs: list[onnx.ValueInfoProto] = []
         self._truths: set[str] = set()
         self._integers: set[str] = set()
+        self._nearly_one: dict[str, float] = {}
 
     def input(self, name: str, width: int, batch: str | int) -> Value:
         """An input `batch x width`."""
@@ -84,6 +87,8 @@ class Graph:
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
             self._constants[key] = numpy_helper.from_array(array, f"c{len(self._constants)}")
+            if array.size == 1 and array.dtype.kind == "f" and 0 < abs(array.item() - 1) <= _SINGLE:
+                self._nearly_one[self._constants[key].name] = array.item()
             if array.dtype.kind in "ib":
                 (self._integers if array.dtype.kind == "i" else self._truths).add(self._constants[key].name)
         return str(self._constants[key].name)
@@ -96,6 +101,12 @@ class Graph:
         self, op: str, inputs: Sequence[str], shape: Sequence[int], real: Sequence[int], **attributes: Any
     ) -> Value:
         """One node; the one before where there is an equal one."""
+        if op in ("Mul", "Div") and (near := [name for name in inputs if name in self._nearly_one]):
+            # ONNX Runtime (1.32, NoopElimination) takes such a constant for 1 in single precision, and leaves it out.
+            doubled = self.constant(2 * self._nearly_one[near[0]])
+            half = self.node(op, [doubled if name == near[0] else name for name in inputs], shape, real)
+            inputs = [half.name, self.constant(0.5 if op == "Mul" or inputs[0] == near[0] else 2.0)]
+            op = "Mul"
         key = (op, *inputs, repr(sorted(attributes.items())))
         if key not in self._known:
             self._known[key] = name = f"v{len(self._known)}"

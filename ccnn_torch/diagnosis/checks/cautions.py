@@ -48,8 +48,8 @@ _OF_PLACE = EXACT | {"coupling", "error_motion", "gravity", "transmission"}
 _PERIODS = 1.5
 # Standard deviations from which a coefficient surely has its sign, and by which it surely is as large.
 _SURELY = 3.0
-# A workshop, with something to spare [K].
-_COLDEST, _HOTTEST = 213.15, 423.15
+# A workshop, with something to spare [K]: -30 to 55 degC. Beyond it is one's degF that is called degC.
+_COLDEST, _HOTTEST = 243.15, 328.15
 # Variances of a joint that are tried, in units of what would be as much as the noise of the usual row.
 _VARIANCES = torch.logspace(-2, 3, 41, dtype=torch.float64)
 # Log likelihood that the scatter of one joint adds, from which it is no chance: noise alone adds up to 2 in trials.
@@ -204,7 +204,7 @@ def _of_nothing_gained(analysis: Analysis, judgement: Judgement, together: Gap) 
 def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Causes of the verdict that would have to be hundreds of times as large as in any machine."""
     said, most = [], implausible_size(analysis)
-    for name, coefficients, mean, sd in _numbers(analysis, judgement):
+    for _, name, coefficients, mean, sd in _numbers(analysis, judgement):
         # A number that the rows hardly determine says nothing of the cause.
         sure = torch.where(torch.tensor([c.secondary for c in coefficients]), 0.0, mean.abs() - _SURELY * sd)
         worst = int(sure.argmax())
@@ -221,11 +221,19 @@ def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
 
 
 def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
-    """Causes of the verdict whose coefficients are clearly negative where physics has none such, and none positive."""
+    """Causes of the verdict whose coefficients are clearly negative where physics has none such, and none positive.
+
+    All that the cause does in a joint or leg has to go against such a coefficient: two that look alike share it.
+    """
     said = []
-    for name, coefficients, mean, sd in _numbers(analysis, judgement):
+    for i, name, coefficients, mean, sd in _numbers(analysis, judgement):
         signed = torch.tensor([c.positive for c in coefficients])
         negative = torch.nonzero(signed & (mean < -_SURELY * sd))[:, 0].tolist()
+        columns = analysis.dictionary.columns[..., analysis.dictionary.groups[i]].flatten(0, 1)
+        of = [(c.joint, c.leg) for c in coefficients]
+        own = torch.tensor([[one == other for other in of] for one in of])
+        against = (columns * (columns @ (own * mean).mT)).sum(0) < 0
+        negative = [k for k in negative if against[k]]
         if negative and not bool((signed & (mean > _SURELY * sd)).any()):
             where = ", ".join(coefficients[k].name for k in negative)
             wrong = f"{name} would have to be negative ({where}), as in no machine"
@@ -233,16 +241,18 @@ def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     return said
 
 
-def _numbers(analysis: Analysis, judgement: Judgement) -> Iterator[tuple[str, tuple[Coefficient, ...], Tensor, Tensor]]:
-    """Of each cause of the verdict its name, coefficients, and these with their standard deviations, `m` each, in
-    plausible sizes."""
+def _numbers(
+    analysis: Analysis, judgement: Judgement
+) -> Iterator[tuple[int, str, tuple[Coefficient, ...], Tensor, Tensor]]:
+    """Of each cause of the verdict its number, name, coefficients, and these with their standard deviations, `m` each,
+    in plausible sizes."""
     found = judgement.acting
     sd = covariance(analysis.dictionary, found).diagonal().clamp_min(1e-300).sqrt()
     own_of = torch.split(sd, [len(mean) for mean in found.mean])
     for i, mean, own in zip(found.members, found.mean, own_of, strict=True):
         atom = analysis.atoms[i]
         if atom.name in judgement.names and (coefficients := atom.coefficients(analysis.situation)):
-            yield atom.name, coefficients, mean, own
+            yield i, atom.name, coefficients, mean, own
 
 
 def _of_scatter(analysis: Analysis, judgement: Judgement) -> list[Caution]:
@@ -277,16 +287,21 @@ def _of_periods(analysis: Analysis, judgement: Judgement) -> list[Caution]:
 
 def _of_columns(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Columns that are late, exchanged or of the other sign, where something is not explained."""
-    wrong = column_mistake(analysis) if judgement.outside else ""
+    doubtful = judgement.outside or _strange_temperature(analysis.situation)
+    wrong = column_mistake(analysis) if doubtful else ""
     return [Caution(wrong, _HOLLOW)] if wrong else []
 
 
-def _of_temperature(situation: Situation) -> list[Caution]:
+def _strange_temperature(situation: Situation) -> bool:
     temperature = situation.covariates.get("temperature")
-    if temperature is None or _COLDEST < float(temperature.median()) < _HOTTEST:
+    return temperature is not None and not _COLDEST < float(temperature.median()) < _HOTTEST
+
+
+def _of_temperature(situation: Situation) -> list[Caution]:
+    if not _strange_temperature(situation):
         return []
-    usual = f"{float(temperature.median()) - 273.15:.0f} °C"
-    return [Caution(f"the temperature is about {usual}: check the unit of its column, K or degC")]
+    usual = f"{float(situation.covariates['temperature'].median()) - 273.15:.0f} °C"
+    return [Caution(f"the temperature is about {usual}: check the unit of its column, degC, degF or K")]
 
 
 def _of_inputs(analysis: Analysis, missing: Sequence[Mapping[str, Any]]) -> list[Caution]:
@@ -385,6 +400,8 @@ def column_mistake(analysis: Analysis) -> str:
 def _corrections(situation: Situation, columns: list[str]) -> Iterator[tuple[str, dict[str, Tensor]]]:
     """What is wrong, in words, and the covariates as they would be without it."""
     given = dict(situation.covariates)
+    if "temperature" in columns and _strange_temperature(situation):
+        yield "temperature seems to be in degF", given | {"temperature": 273.15 + (given["temperature"] - 305.15) / 1.8}
     every = " and ".join(columns) if len(columns) < 3 else f"{columns[0]} to {columns[-1]}"
     for step, word in ((-1, "late"), (1, "early")):
         # The row that comes round is one of many.
