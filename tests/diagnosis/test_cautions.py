@@ -161,17 +161,26 @@ def test_a_temperature_in_degf_is_found_out() -> None:
     assert said == "temperature seems to be in degF" and torch.allclose(corrected["temperature"], hall)
 
 
-def test_a_number_below_zero_that_another_makes_up_for_is_no_doubt() -> None:
+@pytest.mark.parametrize(("inner", "doubted"), [(4.0, False), (0.0, True)])
+def test_a_number_below_zero_that_another_makes_up_for_is_no_doubt(
+    monkeypatch: pytest.MonkeyPatch, inner: float, doubted: bool
+) -> None:
     """The torques of all links and of the inner ones look alike: what the joint does in all goes with its weight."""
     links = [[0.0, math.pi / 2, 0.4, 0.0], [0.7, 0.0, 0.0, 0.0], [0.6, 0.0, 0.0, 0.0]]
     arm = SerialArm("three", "standard", links)
-    joints = arm.sample_joints(150, torch.Generator().manual_seed(9))
-    situation = Situation(arm, joints, {}, default_gravity(arm))
-    both = acting(situation, "gravity", q2=-2e-3, q2_inner_links=6e-3)
-    effects = ["geometry", "joint_offset", "joint_gain", "transmission", "gravity"]
-    found = diagnose_rows(situation, reached_with(situation, [both], 10), effects=effects)
+    situation = Situation(arm, arm.sample_joints(90, torch.Generator().manual_seed(9)), {}, default_gravity(arm))
+    pose = reached_with(situation, [acting(situation, "gravity", q2=2e-3, q3=1e-3)], 10)
+    numbers = cautions._numbers
+
+    def split(analysis: Analysis, judgement: Judgement):  # type: ignore[no-untyped-def]
+        for i, name, coefficients, mean, sd in numbers(analysis, judgement):
+            values = {"q2": -1.0, "q3": -1.0, "q2 inner links": inner, "q3 inner links": inner}
+            yield i, name, coefficients, mean.new_tensor([values.get(c.name, 0.0) for c in coefficients]), 0.01 + 0 * sd
+
+    monkeypatch.setattr(cautions, "_numbers", split)
+    found = diagnose_rows(situation, pose, effects=["geometry", "joint_offset", "gravity"])
     assert found.verdict["effects"] == ["gravity"]
-    assert not any("would have to be negative" in caution for caution in found.cautions)
+    assert any("would have to be negative (q2, q3)" in caution for caution in found.cautions) is doubted
 
 
 def test_noise_that_hides_everything_is_doubted() -> None:
