@@ -8,6 +8,8 @@ they have to be: where a plate stands is no error of the machine, and what they 
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -24,7 +26,7 @@ from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.rows import fitted_frames, in_groups
 from ccnn_torch.diagnosis.residual.whitening import Whitening, device_axes, moving_channels, renewed
 from ccnn_torch.effects import Acting, Effect, Situation, measured_channels, moved
-from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
+from ccnn_torch.evidence.marginal_likelihood import SPREAD, Fits, Grams, fit_sets, grams_of
 from ccnn_torch.evidence.priors import EFFECT, WIDE
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
@@ -46,7 +48,10 @@ _RENEWALS = 2
 _TIMES = 2
 # Groups of which it is fitted whether the rows are as probable without them, before all others are.
 _TRIED = 4
-_PARAMETERS, _FRAMES = "parameters", "frames"
+# Standard deviation of log α² of a part of an effect: a factor of 1.6 in α. What metals grow by is known; thermometers
+# that warm together would have a part grow by one and shrink by the other, ten times as much as any.
+_OF_PART = 1.0
+_PARAMETERS, _FRAMES, _NO_PARTS = "parameters", "frames", ("", "secondary")
 _Label = tuple[str, str]
 
 
@@ -82,7 +87,7 @@ def fit_jointly(
     white = rows.whitening()
     for _ in range(_ROUNDS):
         white = replace(white, weight=torch.where(rows.fine[:, None], white.weight, 0.0))
-        fit = fit_sets(rows.grams(white), [rows.groups], 0.0)
+        fit = _fitted(rows, white)
         before, (at, rows) = rows, _most_probable(rows, at, white, fit, measured)
         change, left = (white(v).norm() for v in (rows.left - before.left, rows.left))
         white = rows.renewed(white, fit, rows.left)
@@ -391,7 +396,20 @@ def _at_better_shape(rows: _Rows, i: int, scan: Scan) -> _Rows:
 
 
 def _fitted(rows: _Rows, white: Whitening) -> Fits:
-    return fit_sets(rows.grams(white), [rows.groups], 0.0)
+    return _fit(rows.grams(white), [rows.grouped])
+
+
+def _is_part(label: _Label) -> bool:
+    """Whether a group is a named part of an effect."""
+    return label[0].isdigit() and label[1] not in _NO_PARTS
+
+
+def _fit(grams: Grams, sets: Sequence[Mapping[_Label, Tensor]]) -> Fits:
+    """Of sets of groups; a part of an effect that is there or not for itself is about as large as is plausible."""
+    named = [[_OF_PART if _is_part(label) else SPREAD for label in s] for s in sets]
+    most = max(1, *map(len, named))
+    spread = torch.tensor([[*s, *[SPREAD] * (most - len(s))] for s in named], dtype=grams.yy.dtype)
+    return fit_sets(grams, [[*s.values()] for s in sets], 0.0, spread=spread)
 
 
 def _left_by_all(rows: _Rows, white: Whitening) -> tuple[Fits, Tensor]:
@@ -420,20 +438,24 @@ def _gained_without(fit: Fits, groups: Mapping[_Label, Tensor], removed: Sequenc
 def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
     """The effects whose marginal likelihood pays for them, one after the other."""
     grams, groups = rows.grams(white), rows.grouped
+    parts = Counter(name for name, part in groups if _is_part((name, part)))
     while True:
         names = [label for label in groups if label[0] != _PARAMETERS]
         # With an effect goes what is secondary in it.
         removed = [[n for n in names if n[0] == name and part in ("", n[1])] for name, part in names]
         if not removed:
             break
-        # An effect costs its place in the library; what is secondary in one that is there is as likely there as not.
-        worth = torch.tensor([0.0 if part else EFFECT for _, part in names])
-        gain = _gained_without(fit_sets(grams, [[*groups.values()]], 0.0), groups, removed) - worth
+        # An effect costs its place in the library; what is secondary in one that is there is as likely there as not,
+        # and of many parts, each by a thermometer of its own, one or so is there (Scott and Berger 2010).
+        worth = torch.tensor(
+            [-math.log(parts[n[0]]) if _is_part(n) else 0.0 if n[1] else EFFECT for n in names], dtype=grams.yy.dtype
+        )
+        gain = _gained_without(_fit(grams, [groups]), groups, removed) - worth
         order, fitted = gain.argsort(descending=True).tolist(), list[int]()
         # Those that gain most with the scales as they are, and all before none is said to.
         for some in (order[:_TRIED], order[_TRIED:]):
-            sets = [[g for label, g in groups.items() if label not in removed[k]] for k in some]
-            evidence = fit_sets(grams, [[*groups.values()], *sets], 0.0).log_evidence
+            sets = [{label: g for label, g in groups.items() if label not in removed[k]} for k in some]
+            evidence = _fit(grams, [groups, *sets]).log_evidence
             gain[some] = evidence[1:] - evidence[0] - worth[some]
             # An effect stays until its idle parts are gone, whose number is no evidence against what is left of it.
             idle = {name for (name, part), g in zip(names, gain.tolist(), strict=True) if part and g >= 0}

@@ -31,8 +31,8 @@ JITTER = 1e-13
 same, far above the noise, would leave no digit of the 1."""
 # Principal axes with less than this share of the largest one's squares are rounding.
 _DIGITS = 1e-14
-# Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
-_SPREAD = 4.0
+SPREAD = 4.0
+"""Of log α² about a coefficient's plausible size: a factor of 7 in α, either way."""
 _LIMIT = 25.0
 # Updates begin with the mean square over this as variance of the noise.
 _FIRST_NOISE = 10.0
@@ -130,12 +130,12 @@ class Prior(NamedTuple):
     Attributes:
         values: how many values are explained.
         noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
-        spread: standard deviation of log α².
+        spread: standard deviation of log α², of all groups or of each, `b x g`.
     """
 
     values: float
     noise_dof: float
-    spread: float = _SPREAD
+    spread: float | Array = SPREAD
 
 
 def fit_sets(
@@ -143,7 +143,7 @@ def fit_sets(
     sets: Sequence[Sequence[Tensor]],
     noise_dof: float,
     iterations: int = _UPDATES,
-    spread: float = _SPREAD,
+    spread: float | Tensor = SPREAD,
     start: tuple[Tensor, Tensor] | None = None,
 ) -> Fits:
     """Fit every set of groups.
@@ -153,7 +153,7 @@ def fit_sets(
         sets: each a sequence of groups, a group being the indices of its columns, int64.
         noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
         iterations: MacKay updates.
-        spread: standard deviation of log α².
+        spread: standard deviation of log α², of all groups or of each, `b x g`.
         start: log α² of each group, `b x g`, and σ², `b`, to begin with.
     """
     groups = max(max(map(len, sets), default=0), 1)
@@ -172,7 +172,9 @@ def fit_sets(
     there = torch.nn.functional.pad(width > 0, (1, 0))
     if start is not None:
         start = torch.nn.functional.pad(start[0], (1, 0)), start[1]
-    fits = _most_probable(parts, there, grams.yy, Prior(grams.values, noise_dof, spread), iterations, start)
+    each_spread = torch.nn.functional.pad(spread, (1, 0), value=1.0).numpy() if isinstance(spread, Tensor) else spread
+    prior = Prior(grams.values, noise_dof, each_spread)
+    fits = _most_probable(parts, there, grams.yy, prior, iterations, start)
     return fits._replace(energy=fits.energy[:, 1:], log_scale=fits.log_scale[:, 1:])
 
 
