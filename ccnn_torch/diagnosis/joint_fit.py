@@ -41,6 +41,8 @@ _STEPS, _DAMPING, _LAST = 12, 1e-8, 0.1
 # Standard deviation of a frame's coordinate where the rows leave it open, in plausible errors, and the share of the
 # largest below which they leave a direction open.
 _ANYWHERE, _OPEN = 1e2, 1e-9
+# What a coefficient of plausible size moves by rounding alone: a joint that no weight pulls at [m, rad].
+_NOTHING = 1e-12
 # Estimates of the noise before shapes are searched.
 _RENEWALS = 2
 # Periods that are looked for of an effect that may have any, beside once a turn, which needs no search: a gear train
@@ -313,7 +315,7 @@ class _Rows:
         return torch.cat([self.frames, *self.groups]), (torch.cat([wide, *own]) / fit.noise[0]).sqrt()
 
     def _acting(self) -> dict[tuple[str, str], Tensor]:
-        acts = self.columns.abs().amax((0, 1)) > 0
+        acts = self.columns.abs().amax((0, 1)) > _NOTHING
         found: dict[tuple[str, str], list[int]] = {}
         for k, label in enumerate(self.model.labels()):
             if acts[k]:

@@ -112,7 +112,8 @@ class Script:
         weight = np.where(self.sizes == FREE, 0.1, 1.0)
 
         def residuals(u: Array) -> Array:
-            return np.r_[(self.place(u * self.sizes, joints, told) - seen).ravel() / NOISE, weight * u]
+            left = (self.place(u * self.sizes, joints, told) - seen).ravel() / NOISE
+            return np.asarray(np.r_[left, weight * u])
 
         found = least_squares(residuals, np.zeros(len(sizes)), x_scale="jac")
         self.x, self.left = found.x * self.sizes, -found.fun[: seen.size].reshape(-1, 3) * NOISE
@@ -167,7 +168,8 @@ class Script:
         if self.full:
             far = (MASS[1:].sum() + load) * (a1 + arm.real) + (MASS[3] + load) * reach.real
             moment = n["plate"] * G * far[:, None] * np.stack([-np.sin(q[:, 0]), np.cos(q[:, 0])], -1)
-            tip_over = turned(*moment.T, 0.0, count)
+            about_x, about_y = moment.T
+            tip_over = turned(about_x, about_y, 0.0, count)
             at, frame = tip_over.apply(at), tip_over * frame
         return at, frame
 
@@ -210,7 +212,9 @@ def table(joints: Array, told: Array, seen: Array) -> tuple[str, Array]:
     return ",".join(names[: 13 + seen.shape[1]]), np.c_[np.degrees(joints), told, 1e3 * seen]
 
 
-def judged(seed: int, rows: int, without: tuple[str, ...], names: list[str], kept: Path | None) -> dict[str, tuple]:
+def judged(
+    seed: int, rows: int, without: tuple[str, ...], names: list[str], kept: Path | None
+) -> dict[str, tuple[float, float]]:
     """Root mean square and maximum of what one machine misses [m], by who calibrated it."""
     robot, rng = Robot(seed, without), np.random.default_rng([seed, 1])
     joints, told, inside = day(robot, rows, rng)

@@ -78,10 +78,12 @@ class Palletizer(Mechanism):
             home_joints=[0.0, math.radians(85), math.radians(-20), 0.0],
         )
 
-    def forward_kinematics(self, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
         """Pose of joints, `... x 4`."""
         values = self.resolve(parameters)
-        shape = torch.broadcast_shapes(joints.shape[:-1], values.shape[:-1])
+        shape = torch.broadcast_shapes(joints.shape[:-1], values.shape[:-1])  # type: ignore[no-untyped-call]
         p = {c.name: v.expand(shape) for c, v in zip(self.geometry, values.unbind(-1), strict=True)}
         q1, q2, q3, q4 = (q.expand(shape) for q in joints.unbind(-1))
         zero = torch.zeros_like(q1)

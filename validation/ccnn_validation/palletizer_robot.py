@@ -19,7 +19,7 @@ LOADS, NEW, IRON, ALUMINIUM = np.array([0.0, 60.0]), 400, 11.5e-6, 23e-6
 CAUSES = ("lengths", "bars", "zeros", "leans", "sag", "spring", "rods", "base", "gears", "turns", "play", "warmth")
 
 
-def swung(pivot: Array, link: Array, far: Array, rod: Array, way: Array) -> Array:
+def swung(pivot: Array, link: Array | float, far: Array, rod: Array | float, way: Array) -> Array:
     """Angle from the direction `way` to a link at a pivot whose end a rod holds from afar, in the complex plane."""
     apart = far - pivot
     span = np.abs(apart)
@@ -115,7 +115,8 @@ class Robot:
         weight = np.stack([m2 / 2 + 0 * load, m3 * C3 / L3 + 0 * load, mw + load], -1)
         far = A1 * weight.sum(1) + arm.real * (weight.sum(1) + m3) + reach.real * weight[:, 1:].sum(1)
         moment = G * far[:, None] * np.stack([-np.sin(q[:, 0]), np.cos(q[:, 0])], -1)
-        lean = turned(*(self.plate * moment).T, 0.0, count)
+        about_x, about_y = (self.plate * moment).T
+        lean = turned(about_x, about_y, 0.0, count)
         return np.asarray(lean.apply(at + frame.apply(self.point)))
 
     def spread(

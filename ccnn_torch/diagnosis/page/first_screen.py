@@ -178,7 +178,7 @@ def _measure(results: Block, about: About) -> str:
         aim = f"to see whether {rivals[0]} acts" if len(rivals) == 1 else aim
         path = f"{about.folder}/{NEXT}" if about.folder else NEXT
         motion = wanted[0].get("motion")
-        what = f"{len(wanted)} poses" if motion is None else f"{motion['joint']}: {motion['text']},"
+        what = count_text(len(wanted), "pose") if motion is None else f"{motion['joint']}: {motion['text']},"
         said.append(f"{what} {aim}: {path}.")
     for still, what in ((False, "Record as well"), (True, "Recorded, but never changing")):
         each = [

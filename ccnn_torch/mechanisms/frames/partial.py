@@ -219,9 +219,10 @@ def as_measured(
     unknown = getattr(mechanism, "unknown_frames", ())
     if unknown:
         raise InputError(
-            f"{where}: of the pose {', '.join(whole)} only {', '.join(names)} was measured, which does not show where "
-            f"the {' and the '.join(unknown)} of {mechanism.name} {'is' if len(unknown) == 1 else 'are'}; give "
-            f"{', '.join(n for n in whole if n not in names)} as well, or a machine whose frames are known"
+            f"{where}: of the pose {', '.join(whole)} only {', '.join(names)} was measured, and the "
+            f"{' and the '.join(unknown)} of {mechanism.name} {'is' if len(unknown) == 1 else 'are'} fitted to whole "
+            f"poses; give {', '.join(n for n in whole if n not in names)} as well, or a machine with its place among "
+            "its own parameters (docs/how_to/mechanisms.md, 'A reflector alone')"
         )
     return Partial(mechanism, names)
 
