@@ -30,7 +30,7 @@ from ccnn_torch.diagnosis.verdict.text import (
     undetermined,
     words_for,
 )
-from ccnn_torch.display import number_text, to_enter, unit_text
+from ccnn_torch.display import count_text, number_text, to_enter, unit_text
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.report.page import Answer, Card
