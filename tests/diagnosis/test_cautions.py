@@ -239,6 +239,22 @@ def test_rows_at_one_place_and_a_joint_that_stands_still_are_doubted() -> None:
     assert any("q2 did not move" in caution for caution in check_rows(still, still.pose.clone()).cautions)
 
 
+@pytest.mark.parametrize(
+    ("steps", "said"), [(2, "before a change of load_x: it seems to be written down late"), (0, "")]
+)
+def test_a_load_that_is_written_down_late_is_found_out(steps: int, said: str) -> None:
+    rows = rows_of("five_bar", 120, 21)
+    drawn = torch.Generator().manual_seed(22)
+    load = (900 * torch.rand(12, generator=drawn, dtype=torch.float64)).repeat_interleave(10)
+    situation = replace(rows, covariates={"load_x": load})
+    pose = reached_with(situation, [acting(situation, "compliance", q1=1e-6, q2=1e-6)], 23)
+    noted = torch.cat([load[:steps], load[: len(load) - steps]])
+    noise = torch.full((3,), NOISE, dtype=torch.float64)
+    found = diagnose_rows(replace(situation, covariates={"load_x": noted}), pose, noise, FEW)
+    assert found.verdict["effects"] == ["compliance"]
+    assert any(said in caution for caution in found.cautions) if said else not found.cautions
+
+
 def test_copies_of_rows_count_once() -> None:
     situation = rows_of("five_bar", 60, 18)
     pose = measured(situation, {"backlash": 8.0}, 19)

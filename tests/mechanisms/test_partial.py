@@ -83,7 +83,9 @@ def test_records_may_hold_a_part_of_the_pose_but_no_misspelt_column(tmp_path: Pa
     turns = {f"r{a}[rad]": 0.1 * z for a in "xyz"}
     # An angle is never proposed for a length.
     shown = load_records(_file(tmp_path, arm, turns), arm, learns=False)
-    with pytest.raises(InputError, match=r"the base and the tool of .* are fitted to whole poses; give x, y, z as well"):
+    with pytest.raises(
+        InputError, match=r"the base and the tool of .* are fitted to whole poses; give x, y, z as well"
+    ):
         as_measured(arm, shown.pose_coordinates)
 
 

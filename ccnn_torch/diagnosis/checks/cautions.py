@@ -79,6 +79,7 @@ def cautions(
     return [
         *row_cautions(analysis, rows, judgement.names),
         *_of_place(analysis, judgement),
+        *_of_changes(analysis),
         *_of_noise(analysis, judgement),
         *_of_nothing_gained(analysis, judgement, together),
         *_of_sizes(analysis, judgement),
@@ -132,6 +133,29 @@ def _of_place(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     )
     words = f"the {count} rows set aside as far off lie together, about {named}: something may act there alone"
     return [Caution(words, _HOLLOW)]
+
+
+def _of_changes(analysis: Analysis) -> list[Caution]:
+    """Rows set aside just before a change of a load, or from one on: it was written down late, or early."""
+    aside = ~analysis.whitening.counted & ~analysis.near_singular
+    if int(aside.sum()) < _SEVERAL:
+        return []
+    # Loads scipy's distributions, which only such rows wait for.
+    from scipy.stats import hypergeom
+
+    for name, values in analysis.situation.covariates.items():
+        if not name.startswith("load_") or values.dim() != 1:
+            continue
+        changes = torch.nonzero(values.diff())[:, 0]
+        for steps, word, mistake in (((-1, 0), "before", "late"), ((1, 2), "after", "early")):
+            near = torch.zeros_like(aside)
+            near[torch.cat([changes + step for step in steps]).clamp(0, len(near) - 1)] = True
+            both = int((aside & near).sum())
+            chance = hypergeom.sf(both - 1, len(near), int(near.sum()), int(aside.sum()))
+            if chance < _BY_CHANCE:
+                words = f"{both} of the {int(aside.sum())} rows set aside as far off lie just {word} a change of {name}"
+                return [Caution(f"{words}: it seems to be written down {mistake}")]
+    return []
 
 
 def _of_plan(analysis: Analysis, names: Sequence[str]) -> list[Caution]:
