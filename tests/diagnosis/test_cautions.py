@@ -255,6 +255,18 @@ def test_a_load_that_is_written_down_late_is_found_out(steps: int, said: str) ->
     assert any(said in caution for caution in found.cautions) if said else not found.cautions
 
 
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_drift_without_a_thermometer_is_doubted(recorded: bool) -> None:
+    rows = rows_of("delta_linear", 120, 31)
+    kept = [n for n in rows.covariates if n == "time" or (recorded and n == "temperature")]
+    situation = replace(rows, covariates={n: rows.covariates[n] for n in kept})
+    moved = acting(situation, "frame_drift", x=3e-4, z=2e-4)
+    noise = torch.full((3,), NOISE, dtype=torch.float64)
+    found = diagnose_rows(situation, reached_with(situation, [moved], 32), noise, [*FEW, "thermal", "frame_drift"])
+    assert found.verdict["effects"] == ["frame_drift"]
+    assert any("no temperature was recorded" in caution for caution in found.cautions) is not recorded
+
+
 def test_copies_of_rows_count_once() -> None:
     situation = rows_of("five_bar", 60, 18)
     pose = measured(situation, {"backlash": 8.0}, 19)

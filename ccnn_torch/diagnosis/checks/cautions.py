@@ -25,7 +25,7 @@ from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.diagnosis.verdict.remainder import times_as_scatter, times_the_noise
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Coefficient, Situation
-from ccnn_torch.effects.time import ROW
+from ccnn_torch.effects.time import ROW, Drift, FrameDrift
 from ccnn_torch.evidence.dictionary import covariance
 from ccnn_torch.evidence.judge import BESIDE_UNKNOWN
 from ccnn_torch.evidence.marginal_likelihood import fit_sets, grams_of
@@ -86,6 +86,7 @@ def cautions(
         *_of_signs(analysis, judgement),
         *_of_columns(analysis, judgement),
         *_of_inputs(analysis, missing),
+        *_of_warmth(analysis, judgement, missing),
         *_of_scatter(analysis, judgement),
         *_of_periods(analysis, judgement),
     ]
@@ -342,6 +343,15 @@ def _of_inputs(analysis: Analysis, missing: Sequence[Mapping[str, Any]]) -> list
         for c in lacking
         if sizes.get(c.name, {}).get(name, noise) >= noise
     ]
+
+
+def _of_warmth(analysis: Analysis, judgement: Judgement, missing: Sequence[Mapping[str, Any]]) -> list[Caution]:
+    """A drift where no temperature was recorded: a machine that grows in the course of a day drifts as well."""
+    grows = any("thermal" in entry["effects"] for entry in missing)
+    recorded = any(map(is_temperature, analysis.situation.covariates))
+    if not grows or recorded or not {FrameDrift.name, Drift.name} & {*judgement.names}:
+        return []
+    return [Caution("no temperature was recorded, and a machine that grows with it drifts as well: record temperature")]
 
 
 class Scatter(NamedTuple):
