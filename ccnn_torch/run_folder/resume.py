@@ -45,7 +45,7 @@ class FolderJob(Generic[_Config, _Data]):
         model: class of its config.
         results: the file that is written last.
         checkpoints: pattern of the files that hold the fingerprint of the config.
-        prepare: checks a config before a folder is made; gives its data.
+        prepare: checks a config before anything is written; gives its data.
         compute: fills a folder from config and data; then `quiet` and `details`, whether tables are shown
             as well; None: no result at all.
     """
@@ -64,8 +64,9 @@ class FolderJob(Generic[_Config, _Data]):
             InputError: the config or its data cannot be used, or the folder is taken or in use.
             WriteError: a file cannot be written; what was computed until then is kept.
         """
-        data = self.prepare(config)
+        # A folder that is taken is refused before records are read, which may take a minute.
         with RunFolder.fresh(config.out, config.name, f"{self.command} --resume") as folder:
+            data = self.prepare(config)
             folder.write("config.yaml", config.to_yaml(folder.path))
             try:
                 self.compute(config, data, folder, quiet, details)
