@@ -184,6 +184,7 @@ class Thermal(Effect):
             for j in mechanism.joints
             if j.unit == "m"
         ]
+        sliding = [j.name for j in mechanism.joints if j.unit == "m"]
         low, high = situation.workspace
         drives += [
             Coefficient(f"{j.name} mount", f"{j.unit}/K", _mount(j.unit, reach), joint=j.name, secondary=True)
@@ -194,7 +195,8 @@ class Thermal(Effect):
         if "time" in situation.covariates:
             own = _STEEL * _OWN_WARMTH
             found.append(Coefficient("at once", "1/K", uneven, secondary=True))
-            found += [replace(c, name=_late(c), secondary=True, positive=False) for c in (*following, *drives)]
+            later = [*following, *(c for c in drives if c.joint in sliding)]
+            found += [replace(c, name=_late(c), secondary=True, positive=False) for c in later]
             found += [
                 Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
                 for j in mechanism.joints
@@ -246,7 +248,7 @@ class Thermal(Effect):
         apart = [longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism)]
         travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
         following = [whole, *apart, travel]
-        timed = [whole, *following, jacobian, jacobian, *following] if _timed(situation) else []
+        timed = [whole, *following, jacobian[..., sliding], jacobian, *following] if _timed(situation) else []
         bodies = [longer[..., p.lengths].sum(-1, keepdim=True) for p in like_parts(mechanism)]
         others = [whole, *apart, *bodies, travel, jacobian] * len(situation.thermometers)
         return torch.cat([*following, jacobian, whole, *timed, *bodies, *others], -1)
@@ -264,7 +266,7 @@ class Thermal(Effect):
             time = situation.covariates["time"]
             body, core = (lagged(time, warm, shape[..., k]) for k in (0, 1))
             own = -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
-            kinds += [(warm, 1), (core, following + n), (warm - body, n), (own, following)]
+            kinds += [(warm, 1), (core, following + sliding), (warm - body, n), (own, following)]
             others = [lagged(time, other, shape[..., 0]) for other in others]
         kinds = [(body, following + n), *kinds, (body, bodies)]
         for other in others:
