@@ -48,7 +48,7 @@ _OF_PLACE = EXACT | {"coupling", "error_motion", "gravity", "transmission"}
 _PERIODS = 1.5
 # Standard deviations from which a coefficient surely has its sign, and by which it surely is as large.
 _SURELY = 3.0
-# A workshop, with something to spare [K]: -30 to 55 degC. Beyond it is one's degF that is called degC.
+# A workshop, with something to spare [K]: -30 to 55 degC. The degF of a hall are more, read as degC.
 _COLDEST, _HOTTEST = 243.15, 328.15
 # Variances of a joint that are tried, in units of what would be as much as the noise of the usual row.
 _VARIANCES = torch.logspace(-2, 3, 41, dtype=torch.float64)
