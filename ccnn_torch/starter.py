@@ -286,7 +286,7 @@ def starter_config(
             f"{records}: no column looks like a {what}; it has {', '.join(table.names)}: rename columns, or write the "
             "config by hand (docs/how_to/records.md)"
         )
-    machine, name, why = _machine(found, table, mechanism, ask)
+    machine, name, why = _machine(found, table, mechanism, ask, given)
     columns = _columns(found, table, machine, units, ask)
     columns, why_turned = _turned(columns, table, records)
     split, reason = _split(found, table, columns)
@@ -330,7 +330,7 @@ def _motion_config(records: Path, out: Path, mechanism: str | None, keys: Mappin
 
 
 def _machine(
-    found: Recognised, table: Table, given: str | None, ask: Ask | None
+    found: Recognised, table: Table, given: str | None, ask: Ask | None, loaded: Mechanism | None
 ) -> tuple[Mechanism | None, str | None, str]:
     """The mechanism, its name or file, and why it is taken."""
     why = "given"
@@ -345,7 +345,7 @@ def _machine(
             given = ask(f"Mechanism: a name, or a file of the arm's geometry (.yaml, .urdf){choices}").strip() or None
     if given is None:
         return None, None, ", ".join(suitable_mechanisms(found, table))
-    machine = load_mechanism(given)
+    machine = load_mechanism(given) if loaded is None else loaded
     if not found.goals and len(machine.joints) != found.joints:
         raise InputError(
             f"--mechanism {given}: it has {len(machine.joints)} joints, and {table.path} has columns for "

@@ -16,7 +16,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import load_records, read_table
 from ccnn_torch.simulation.config import SimulateConfig
-from ccnn_torch.simulation.job import simulate_records
+from ccnn_torch.simulation.job import injected_table, simulate_records
 
 Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent
@@ -244,3 +244,12 @@ def test_rows_that_the_changed_machine_does_not_reach_are_drawn_anew() -> None:
     found = torch.stack([made.covariates[f"direction{i}"] for i in (1, 2)], -1)
     assert torch.equal(found[1:], way) and len(made.joints) == 120
     assert torch.isfinite(made.pose).all() and torch.isfinite(machine.forward_kinematics(made.joints)).all()
+
+
+@pytest.mark.parametrize("rows", [1, 20])
+def test_what_only_turns_the_tool_moves_no_position(rows: int) -> None:
+    """An arm is told by its position, also where a cause only turns it, and from one row alone."""
+    made = simulate_records("stewart", ["tool:rx=1mrad", "joint_offset:q1=1mm"], rows)
+    turned, moved = made.injected
+    assert turned.gap < 1e-12 and 1e-5 < moved.gap < 1e-2 and not made.turns
+    assert "RMS error of the position" in injected_table(made).note

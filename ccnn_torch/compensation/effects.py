@@ -30,8 +30,9 @@ _NAMES = (
     "pose",
     "platform",
 )
-# Change of a joint or pose from which on it is none of a machine, but of one that has no such pose [m, rad].
-_MOST = 0.5
+# Change of a joint or pose from which on it is none of a machine, but of one that has no such pose [m, rad]: a winch
+# may be some turns off, and derivatives of 1e9 make 1e3 of the least effect.
+_MOST = 100.0
 # Error of a pose from which Newton's method comes to the right one, as a share of the largest.
 _START = 0.1
 # Parts of `platform`.

@@ -196,7 +196,8 @@ class Thermal(Effect):
             own = _STEEL * _OWN_WARMTH
             found.append(Coefficient("at once", "1/K", uneven, secondary=True))
             later = [*following, *(c for c in drives if c.joint in sliding)]
-            found += [replace(c, name=_late(c), secondary=True, positive=False) for c in later]
+            names = ["late", *(f"{c.name} late" for c in later[1:])]
+            found += [replace(c, name=n, secondary=True, positive=False) for c, n in zip(later, names, strict=True)]
             found += [
                 Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
                 for j in mechanism.joints
@@ -228,9 +229,12 @@ class Thermal(Effect):
         whole = max(float(elapsed(situation.covariates["time"]).max()), 1e-6)
         low, high = (math.log(share * whole) for share in _WARM_SHARES)
         lags = [math.exp(low + (high - low) * k / (_LAGS - 1)) for k in range(_LAGS)]
-        late = [c.name.endswith("late") for c in self.coefficients(situation)]
-        first, second = (tuple(k for k, last in enumerate(late) if last == which) for which in (False, True))
-        return Shape("lag", "s", (0.0, *lags), first), Shape("late lag", "s", tuple(lags), second)
+        mechanism, names = situation.mechanism, [c.name for c in self.coefficients(situation)]
+        # By place: a plate may have a thermometer, and its growth a name that ends alike.
+        late = range(names.index("at once") + 1, len(names))
+        late = late[: 1 + len(_apart(mechanism)) + 2 * sum(j.unit == "m" for j in mechanism.joints)]
+        others = tuple(k for k in range(len(names)) if k not in late)
+        return Shape("lag", "s", (0.0, *lags), others), Shape("late lag", "s", tuple(lags), tuple(late))
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
@@ -279,10 +283,6 @@ class Thermal(Effect):
 def _mount(unit: str, reach: float) -> float:
     """Plausible size [SI/K]; a sliding drive is held at either end of its reach, a turning one moves on its mount."""
     return max(_MOUNT[unit], _STEEL * reach) if unit == "m" else _MOUNT[unit]
-
-
-def _late(coefficient: Coefficient) -> str:
-    return "late" if coefficient.name == "growth" else f"{coefficient.name} late"
 
 
 def _timed(situation: Situation) -> bool:

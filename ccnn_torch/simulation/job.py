@@ -160,6 +160,7 @@ class Simulated:
         outliers: numbers of the bad rows, from 0.
         gap: root of the mean square of the position's error by all effects, without noise and bad rows [m]; where the
             machine only turns, of the rotation's [rad].
+        turns: whether it only turns.
     """
 
     mechanism: Mechanism
@@ -169,6 +170,7 @@ class Simulated:
     injected: tuple[Injected, ...]
     outliers: tuple[int, ...]
     gap: float
+    turns: bool
 
 
 def simulate_records(
@@ -227,8 +229,10 @@ def simulate_records(
             "make them smaller"
         )
     nominal = reached(situation, [])
-    gap = _rms(frame - nominal)
-    alone = iter([_injected(situation, one, nominal) for one in acting])
+    # One row alone does not tell whether its position moves.
+    turns = only_turns(machine.frame(torch.cat([machine.home_pose[None], situation.pose])))
+    gap = _rms(frame - nominal, turns)
+    alone = iter([_injected(situation, one, nominal, turns) for one in acting])
     injected, outliers = [], set[int]()
     for one in wanted:
         if one.outlier:
@@ -236,12 +240,12 @@ def simulate_records(
             turns = machine.frame(machine.home_pose)[1] is not None
             frame = _moved(frame, (situation.visible @ added.unsqueeze(-1)).squeeze(-1), turns)
             outliers |= set(chosen.tolist())
-            injected.append(Injected(one.name, parameters, _rms(added)))
+            injected.append(Injected(one.name, parameters, _rms(added, turns)))
         else:
             injected.append(next(alone))
     pose = _measured(situation, frame, sigma, generator)
     kept = dict(situation.covariates)
-    return Simulated(machine, joints, pose, kept, tuple(injected), tuple(sorted(outliers)), gap)
+    return Simulated(machine, joints, pose, kept, tuple(injected), tuple(sorted(outliers)), gap, turns)
 
 
 def _situation(
@@ -267,7 +271,7 @@ def _measured(situation: Situation, frame: Tensor, sigma: Tensor, generator: tor
     return pose
 
 
-def _injected(situation: Situation, acting: Acting, nominal: Tensor) -> Injected:
+def _injected(situation: Situation, acting: Acting, nominal: Tensor, turns: bool) -> Injected:
     effect = acting.effect
     values = dict(zip((c.name for c in effect.coefficients(situation)), acting.coefficients.tolist(), strict=True))
     units = units_of(effect, situation)
@@ -277,14 +281,13 @@ def _injected(situation: Situation, acting: Acting, nominal: Tensor) -> Injected
         # A shape whose coefficients are all 0 has no influence.
         if any(there[k] for k in (range(len(there)) if shape.columns is None else shape.columns)):
             shown[shape.name] = value
-    gap = _rms(reached(situation, [acting]) - nominal)
+    gap = _rms(reached(situation, [acting]) - nominal, turns)
     return Injected(effect.name, {name: (value, units[name]) for name, value in shown.items()}, gap)
 
 
-def _rms(change: Tensor) -> float:
-    position, rotation = change[..., :3], change[..., 3:]
-    told = position if bool(position.any()) or not rotation.shape[-1] else rotation
-    return float(told.square().sum(-1).mean().sqrt())
+def _rms(change: Tensor, turns: bool) -> float:
+    """Of the position, or of the rotation of a machine that only turns."""
+    return float((change[..., 3:] if turns else change[..., :3]).square().sum(-1).mean().sqrt())
 
 
 def _moved(frame: Tensor, change: Tensor, turns: bool) -> Tensor:
@@ -324,8 +327,7 @@ def injected_table(simulated: Simulated) -> Table:
         for one in simulated.injected
         for name, (value, unit) in one.parameters.items()
     ]
-    parts, turns = [], only_turns(simulated.mechanism.frame(simulated.pose))
-    what, unit = ("rotation", "µrad") if turns else ("position", "µm")
+    parts, (what, unit) = [], ("rotation", "µrad") if simulated.turns else ("position", "µm")
     effects = [one for one in simulated.injected if one.name != OUTLIER]
     if effects:
         alone = "; ".join(f"{one.name} alone {one.gap * 1e6:.3g} {unit}" for one in effects)

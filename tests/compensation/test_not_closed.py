@@ -6,8 +6,10 @@ import torch
 from machines import around, near, with_effects
 from torch import Tensor
 
+from ccnn_torch.compensation import expand_effects
 from ccnn_torch.coordinates import Coordinate, Parameter
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect
+from ccnn_torch.mechanisms import Mechanism, SerialArm
 
 
 class _Cranks(Mechanism):
@@ -48,3 +50,15 @@ def test_a_machine_that_does_not_close_somewhere_has_a_command_there() -> None:
     assert bool(made.machine.effects.changes(rows, covariates)[0].any())
     found = made.solve(apart_joints, covariates[:2])
     assert bool(torch.isfinite(found.command).all()) and not bool(found.inside_domain.any())
+
+
+def test_a_winch_may_be_some_turns_off() -> None:
+    """A gain of 1 % of a motor that goes 300 rad is 3 rad, and no sign of a machine that does not close."""
+    rows = around([300.0, 250.0], 20.0)
+    effect = make_effect("joint_gain")
+    winch = SerialArm("winch", "standard", [[0.4, 0.0, 0.3, 0.0], [0.3, 0.0, 0.0, 0.0]])
+    situation = Situation(winch, rows, {}, default_gravity(winch))
+    count = len(effect.coefficients(situation))
+    one = Acting(effect, torch.zeros(0, dtype=torch.float64), torch.full((count,), 1e-2, dtype=torch.float64))
+    moved, _ = expand_effects(situation, [one], [], 0.1).changes(rows, rows[:, :0])
+    assert moved is not None and torch.allclose(moved, one.change(situation)) and float(moved.abs().max()) > 2.0

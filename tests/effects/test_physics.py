@@ -257,6 +257,17 @@ def test_a_machine_that_grows_evenly_is_the_same_machine_larger(name: str) -> No
     assert torch.allclose(sum(legs[1:], legs[0]), parts["growth"])
 
 
+def test_the_second_lag_is_of_what_is_late_and_of_no_plate() -> None:
+    rows = situation("stewart", temperature=torch.full((9,), REFERENCE, dtype=torch.float64))
+    rows = replace(rows, covariates=dict(rows.covariates) | {"temperature_plate": rows.covariates["temperature"]})
+    effect = make_effect("thermal")
+    names = [c.name for c in effect.coefficients(rows)]
+    first, second = (shape.columns for shape in effect.shapes(rows))
+    legs = [f"{joint.name} {what} late" for what in ("travel", "mount") for joint in rows.mechanism.joints]
+    assert [names[k] for k in second] == ["late", *(f"leg {k} late" for k in range(1, 7)), *legs]
+    assert sorted((*first, *second)) == [*range(len(names))] and names.index("growth plate") in first
+
+
 def test_play_is_the_way_between_both_sides_of_approach() -> None:
     rows = situation("five_bar")
     ends = []
