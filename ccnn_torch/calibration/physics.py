@@ -39,7 +39,8 @@ from ccnn_torch.effects import (
     used_covariates,
     without_pose_effects,
 )
-from ccnn_torch.effects.time import FrameDrift, Thermal, elapsed
+from ccnn_torch.effects.thermal import Thermal
+from ccnn_torch.effects.time import FrameDrift, elapsed
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm, fit_unknown, judge_frames
 from ccnn_torch.mechanisms.frames.partial import completed

@@ -21,7 +21,8 @@ from ccnn_torch.effects.joints import Coupling, JointGain, JointOffset, Transmis
 from ccnn_torch.effects.loads import Bending, Compliance, Gravity, Sag, ThermalCompliance
 from ccnn_torch.effects.protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects.situation import Situation
-from ccnn_torch.effects.time import Drift, FrameDrift, Homing, Latency, Thermal
+from ccnn_torch.effects.thermal import Thermal
+from ccnn_torch.effects.time import Drift, FrameDrift, Homing, Latency
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, sees_directions
 from ccnn_torch.numerics.batching import leading_shape

@@ -24,7 +24,8 @@ from ccnn_torch.effects import (
 )
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
 from ccnn_torch.effects.loads import members
-from ccnn_torch.effects.time import REFERENCE, lagged, velocity
+from ccnn_torch.effects.situation import REFERENCE
+from ccnn_torch.effects.time import lagged, velocity
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
