@@ -194,7 +194,8 @@ def _diagnosis(said: _Judged, is_given: bool, seed: int) -> Diagnosis:
     gap, gap_rotation, listed = blocks(made)
     nothing = not judgement.names and not judgement.outside
     outlier = nothing and bool(rows.astray.any() or gross_outliers(analysis).any())
-    missing = missing_covariates(analysis, said.effects, said.lacking, judgement.drivers, seed)
+    found = [*judgement.names, *judgement.drivers]
+    missing = missing_covariates(analysis, said.effects, said.lacking, found, seed)
     doubts = cautions(analysis, judgement, rows, missing, together)
     doubts += [of_inferred(said.inferred)] if said.inferred else []
     every_driver = dict.fromkeys(d for one in judgement.drivers for d in one.split(CROSS))

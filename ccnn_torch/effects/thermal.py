@@ -24,6 +24,8 @@ _MOUNT = {"m": 2e-6, "rad": 5e-6}
 # Of a drive warmed by its own work [K], and how long that takes [s]; the legs take on a part.
 _OWN_WARMTH, _WARM_UP, _TAKEN_ON = 10.0, 2000.0, 0.4
 _LAGS = 12
+# What the surroundings are taken to have become warmer by at the first row where nobody recorded it [K].
+_RISE = 10.0
 _WARM_SHARES = (0.01, 1.0)
 
 
@@ -38,7 +40,8 @@ class Thermal(Effect):
     of the sliding drives by 1 - exp(-t / 2000 s). By each further thermometer, `temperature_NAME`, growth of all these
     parts by what it shows beyond the first one, and of drives and mounts by what it shows itself, each there or not for
     itself: a leg, or a screw, grows by its own thermometer. Lengths that every leg has one of may grow together, as a
-    base plate does. Without `temperature` the mean of the others stands for it.
+    base plate does. Without `temperature` the mean of the others stands for it; where none was recorded at all, but the
+    time, the surroundings are taken to have become 10 K warmer at the first row: growth that settles.
 
     Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
     derivatives, so the effect is one on the pose: no joint has to replace a length (near a singularity of an arm
@@ -50,20 +53,22 @@ class Thermal(Effect):
     description = "thermal growth with a first-order lag"
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """Temperature, and something that has a length."""
+        """Temperature, or at least the time, and something that has a length."""
         if not members(mechanism) and all(j.unit != "m" for j in mechanism.joints):
             return f"lengths: mechanism '{mechanism.name}' has no parameter in metres"
-        return "" if any(map(is_temperature, covariates)) else "the temperature of the surroundings: temperature[degC]"
+        known = "time" in covariates or any(map(is_temperature, covariates))
+        return "" if known else "the temperature of the surroundings: temperature[degC]"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """The whole machine, its members, its sliding drives; then what is secondary."""
         mechanism = situation.mechanism
-        found = [Coefficient("growth", "1/K", _STEEL, positive=True)]
+        recorded = any(map(is_temperature, situation.covariates))
+        found = [Coefficient("growth", "1/K", _STEEL, positive=recorded)]
         uneven = _STEEL * _UNEVEN
         found += [Coefficient(m.name, "1/K", uneven, joint=m.joint, leg=m.leg) for m in _apart(mechanism)]
         following = [*found]
         drives = [
-            Coefficient(f"{j.name} travel", "1/K", _STEEL, joint=j.name, positive=True)
+            Coefficient(f"{j.name} travel", "1/K", _STEEL, joint=j.name, positive=recorded)
             for j in mechanism.joints
             if j.unit == "m"
         ]
@@ -143,7 +148,7 @@ class Thermal(Effect):
     def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
         """What each of the fixed columns is multiplied by: warmth [K], or what has become of it, `... x s x m`."""
         mechanism = situation.mechanism
-        warm = situation.temperature.expand(situation.joints.shape[:-1]) - REFERENCE
+        warm = _warmth(situation)
         others = [situation.covariates[name] - REFERENCE for name in situation.thermometers]
         n, sliding = len(mechanism.joints), sum(j.unit == "m" for j in mechanism.joints)
         following, one = 1 + len(_apart(mechanism)) + sliding, torch.ones_like(warm)
@@ -166,6 +171,13 @@ class Thermal(Effect):
 def _mount(unit: str, reach: float) -> float:
     """Plausible size [SI/K]; a sliding drive is held at either end of its reach, a turning one moves on its mount."""
     return max(_MOUNT[unit], _STEEL * reach) if unit == "m" else _MOUNT[unit]
+
+
+def _warmth(situation: Situation) -> Tensor:
+    """Of the surroundings beyond the reference, `... x s` [K]."""
+    if any(map(is_temperature, situation.covariates)):
+        return situation.temperature.expand(situation.joints.shape[:-1]) - REFERENCE
+    return _RISE * (elapsed(situation.covariates["time"]).expand(situation.joints.shape[:-1]) > 0)
 
 
 def _timed(situation: Situation) -> bool:

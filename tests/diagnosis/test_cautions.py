@@ -267,6 +267,20 @@ def test_a_drift_without_a_thermometer_is_doubted(recorded: bool) -> None:
     assert any("no temperature was recorded" in caution for caution in found.cautions) is not recorded
 
 
+def test_growth_is_named_without_a_thermometer_and_doubted() -> None:
+    rows = rows_of("delta_linear", 120, 33)
+    time = rows.covariates["time"]
+    warm = replace(rows, covariates={"time": time, "temperature": 293.15 + 6 * (1 - torch.exp(-time / 3000))})
+    pose = reached_with(warm, [acting(warm, "thermal", growth=3e-5)], 34)
+    noise = torch.full((3,), NOISE, dtype=torch.float64)
+    unknown = replace(rows, covariates={"time": time})
+    found = diagnose_rows(unknown, pose, noise, [*FEW, "thermal", "thermal_compliance", "drift", "frame_drift"])
+    assert found.verdict["effects"] == ["thermal"] and 0.8 < found.verdict["probability"] <= 0.9
+    assert any("growth was taken to settle in time" in caution for caution in found.cautions)
+    assert found.missing_covariates[0]["columns"] == ["temperature[degC]"]
+    assert {*found.missing_covariates[0]["effects"]} == {"thermal", "thermal_compliance"}
+
+
 def test_copies_of_rows_count_once() -> None:
     situation = rows_of("five_bar", 60, 18)
     pose = measured(situation, {"backlash": 8.0}, 19)

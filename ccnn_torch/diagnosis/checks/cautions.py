@@ -25,6 +25,7 @@ from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.diagnosis.verdict.remainder import times_as_scatter, times_the_noise
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Coefficient, Situation
+from ccnn_torch.effects.thermal import Thermal
 from ccnn_torch.effects.time import ROW, Drift, FrameDrift
 from ccnn_torch.evidence.dictionary import covariance
 from ccnn_torch.evidence.judge import BESIDE_UNKNOWN
@@ -346,12 +347,13 @@ def _of_inputs(analysis: Analysis, missing: Sequence[Mapping[str, Any]]) -> list
 
 
 def _of_warmth(analysis: Analysis, judgement: Judgement, missing: Sequence[Mapping[str, Any]]) -> list[Caution]:
-    """A drift where no temperature was recorded: a machine that grows in the course of a day drifts as well."""
-    grows = any("thermal" in entry["effects"] for entry in missing)
+    """Growth or a drift where no temperature was recorded: its course is guessed, and what grows otherwise drifts."""
+    grows = any(Thermal.name in entry["effects"] for entry in missing)
     recorded = any(map(is_temperature, analysis.situation.covariates))
-    if not grows or recorded or not {FrameDrift.name, Drift.name} & {*judgement.names}:
+    if not grows or recorded or not {Thermal.name, FrameDrift.name, Drift.name} & {*judgement.names}:
         return []
-    return [Caution("no temperature was recorded, and a machine that grows with it drifts as well: record temperature")]
+    guessed = "no temperature was recorded: growth was taken to settle in time, and other growth looks like a drift"
+    return [Caution(f"{guessed}: record temperature")]
 
 
 class Scatter(NamedTuple):

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import is_temperature
 from ccnn_torch.diagnosis.candidates.atom import default_shape, scaled_signature, textbook_shapes
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.diagnosis.search.analysis import Analysis
@@ -18,32 +19,33 @@ from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Effect, Situation, missing_on, pose_residual
 from ccnn_torch.effects.backlash import Backlash
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
+from ccnn_torch.effects.thermal import Thermal
 from ccnn_torch.effects.time import ROW, FrameDrift, Homing
 from ccnn_torch.errors import InputError
 from ccnn_torch.evidence.dictionary import gain_beside
 from ccnn_torch.records.commanded import SECOND
 
 # Speeds are not among them: rows at rest, as most are, have none.
-_KINDS = ("time", "temperature", "direction", "load")
+_KINDS = ("temperature", "time", "direction", "load")
 # A usual row is found among so many.
 _ROWS = 60
 
 
 def missing_covariates(
-    analysis: Analysis, effects: Sequence[Effect], lacking: Mapping[str, str], drivers: Sequence[str], seed: int
+    analysis: Analysis, effects: Sequence[Effect], lacking: Mapping[str, str], found: Sequence[str], seed: int
 ) -> list[dict[str, Any]]:
     """The block `missing_covariates` of diagnosis.json: what to record beside the pose, most promising first.
 
     The plausible size of an effect is what its coefficients, each of its plausible size, do to the median row under
     conditions drawn for them (`draw_covariates`: a shift in a hall, loads of 60 N and 6 N·m). What a simulator takes
-    and was not told goes by the simulator's name. Where something that no effect describes follows the time, the
-    temperature comes first.
+    and was not told goes by the simulator's name. Where something that no effect describes follows the time, or growth
+    follows it, the temperature comes first.
 
     Args:
         analysis: of the rows.
         effects: all candidates.
         lacking: what is missing for those of them that the rows cannot show, by name.
-        drivers: of what no effect describes.
+        found: names of the verdict, and drivers of what no effect describes.
         seed: of the conditions drawn.
     """
     rows = torch.unique(torch.linspace(0, len(analysis.situation.joints) - 1, _ROWS).round().long())
@@ -51,31 +53,33 @@ def missing_covariates(
     mechanism, units = here.mechanism, covariate_units(here.mechanism) | {"temperature": "degC"}
     drawn = draw_covariates(mechanism, here.joints, torch.Generator().manual_seed(seed))
     names = [*here.covariates]
+    # Growth by the time alone is shown, but not what it grows with.
+    guessed = set() if any(map(is_temperature, names)) else {Thermal.name}
     kinds = {k: [n for n in drawn if n.startswith(k) and n not in names] for k in _KINDS}
     # One machine for all of them: its derivatives may be dear.
     there = replace(here, covariates=drawn | dict(here.covariates))
     position = bool(analysis.whitening.lengths.any())
     alike = [k for k, c in enumerate(mechanism.channels) if (c.unit == "m") == position]
-    found: dict[tuple[str, ...], dict[str, float]] = {}
-    for effect in (e for e in effects if lacking.get(e.name)):
+    shown: dict[tuple[str, ...], dict[str, float]] = {}
+    for effect in (e for e in effects if lacking.get(e.name) or e.name in guessed):
         added = next((a for a in _additions(kinds) if not effect.missing(mechanism, [*names, *a])), None)
         size = 0.0
         # A user's own effect that fails on columns that were not recorded must not cost the verdict.
         with suppress(InputError):
             size = 0.0 if added is None or missing_on(effect, there) else _plausible(there, effect, alike)
         if added is not None and size > 0:
-            found.setdefault(added, {})[effect.name] = size
+            shown.setdefault(added, {})[effect.name] = size
     for condition in mechanism.lacking(names):
         if condition.name in drawn:
             other = replace(here, covariates={**here.covariates, condition.name: drawn[condition.name]})
             size = _usual(pose_residual(other, here.pose)[:, alike])
             if size > 0:
-                found.setdefault((condition.name,), {})[mechanism.name] = size
+                shown.setdefault((condition.name,), {})[mechanism.name] = size
     entries: list[dict[str, Any]] = [
         {"columns": [f"{n}[{units[n]}]" for n in added], "effects": sizes, "unit": "m" if position else "rad"}
-        for added, sizes in found.items()
+        for added, sizes in shown.items()
     ]
-    first = "temperature" if "time" in drivers else ""
+    first = "temperature" if {"time", *guessed} & {*found} else ""
     return sorted(
         entries, key=lambda e: (not first or not e["columns"][0].startswith(first), -max(e["effects"].values()))
     )
