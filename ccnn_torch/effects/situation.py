@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ PLATFORM_WEIGHT = 100.0
 WEIGHTS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 """Weights that a machine may have [N], for weights that act on the joints together with a load that was recorded."""
 _SAMPLES = 128
+_SAMPLED: WeakKeyDictionary[Mechanism, dict[bytes, Tensor]] = WeakKeyDictionary()
 # Share of the nominal spread below which coordinates that were shown are those of the rows.
 _FAR_LESS = 0.5
 # Cosine below which two axes are square to each other.
@@ -238,8 +240,14 @@ class Situation:
 
         What an effect takes from here (a middle, a range) does not depend on the rows it is evaluated on.
         """
-        joints = self.mechanism.sample_joints(_SAMPLES, torch.Generator().manual_seed(0))
-        return Situation(self.mechanism, joints[torch.isfinite(joints).all(-1)], {}, self.gravity)
+        machine, gravity = self.mechanism, self.gravity
+        # Many situations have one machine, and where its joints are searched a sample is dear.
+        kept = _SAMPLED.setdefault(machine, {})
+        key = b"".join(v.numpy().tobytes() for v in (machine.nominal, *machine.bounds))
+        if key not in kept:
+            joints = machine.sample_joints(_SAMPLES, torch.Generator().manual_seed(0))
+            kept[key] = joints[torch.isfinite(joints).all(-1)]
+        return Situation(machine, kept[key], {}, gravity)
 
     @cached_property
     def workspace(self) -> tuple[Tensor, Tensor]:
