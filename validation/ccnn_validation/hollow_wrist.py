@@ -6,9 +6,9 @@ stand the temperature of the arm, the payload and each axis' last direction. The
 lengths, twists, zeros, reducers once and twice a motor's turn and bevel gears in the wrist, each on the shafts it sits
 on, ratios of coupling a little off, joints and a bearing that give under weight, lost motion, growth, a stand that
 drifts. Ours (`ccnn run`, by the written file) has the Denavit-Hartenberg table; "sheet" also gears, masses and centres,
-"loads" also the moments of the tools, "shafts" the user's own class `hollow_wrist_shafts.Wrist` whose joints are the
-turns of the motors. The plain SciPy script (`hollow_wrist_script`) has lengths, twists, zeros and soft joints, the
-fuller one all causes; also with a Gaussian process on what is left. Judged another day with a tool of 8 kg, in the frame
+"loads" also the moments of the tools, "shafts" (only `--without tools`, one reflector for both) the user's own class
+`hollow_wrist_shafts.Wrist` whose joints are the turns of the motors. The plain SciPy script (`hollow_wrist_script`) has lengths, twists, zeros and soft joints, the
+fuller one all causes ("no shafts": each on its joint); also with a Gaussian process on what is left. Judged another day with a tool of 8 kg, in the frame
 and at the tool point that suit best, RMS and largest [µm]; "of a reading" is what a reading is off. `--without NAME` of
 `CAUSES` switches a true error off, `--keep FOLDER` keeps the files, `--ours NAMES` chooses of `OURS`.
 """
@@ -31,7 +31,7 @@ from ccnn_validation.drawn import commanded
 from ccnn_validation.hollow_wrist_robot import (
     ALPHA, CAUSES, CENTRES, D, GEARS, HIGH, LOW, MASSES, POINTS, SHAFTS, THETA, TOOLS, A, G, Robot, frames,
 )  # fmt: skip
-from ccnn_validation.hollow_wrist_script import Told, by_process, corrected, fit
+from ccnn_validation.hollow_wrist_script import Told, by_process, corrected, fit, prefit
 
 Array = NDArray[np.float64]
 NEW, HOURS = 400, 3.0
@@ -57,11 +57,14 @@ tool_per: [tool]
 """
 SHEET = ARM + f"gears: {listed(GEARS)}\nmasses: {listed(MASSES)}\ncentres: {listed(CENTRES)}\n"
 PLAIN = "mechanism: machine.yaml\n"
+GEARED = f"mechanism: machine.py:Wrist\nmechanism_keys: {{gears: {listed(GEARS)}, allow_code: true}}\n"
+WRIST = (Path(__file__).parent / "hollow_wrist_shafts.py").read_text()
 # Of ours: its machine file, config, columns of loads, and whether joints are those of the motors.
 OURS = {
     "ours": (ARM, PLAIN, False, False),
     "ours, sheet": (SHEET, PLAIN, False, False),
     "ours, loads": (SHEET, PLAIN, True, False),
+    "ours, shafts": (WRIST, GEARED, True, True),
 }
 
 
@@ -105,6 +108,7 @@ def table(
     mass = np.array([TOOLS[int(k)][0] for k in kind])
     if loads:
         last = frames(joints, A, np.radians(ALPHA), D, np.radians(THETA))[:, 6]
+        # By the data sheet: from the reflector to the tool's centre of mass.
         arm = np.array([TOOLS[int(k)][1] for k in kind]) - POINTS[kind]
         arm = (turn @ (last[:, :3, :3] @ arm[..., None]))[..., 0]
         moment = np.cross(arm, [0, 0, -G]) * mass[:, None]
@@ -122,6 +126,8 @@ def judged(
     seed: int, rows: int, without: tuple[str, ...], kept: Path | None, names: list[str]
 ) -> dict[str, list[float]]:
     """RMS and largest miss of one machine [m], by who calibrated it; NaN where there were no commands."""
+    if "tools" in without:
+        POINTS[1:] = POINTS[0]
     robot, rng = Robot(seed, without), np.random.default_rng([seed, 1])
     joints, share = day(rows, rng), np.linspace(0, 1, rows)
     kind, time = (share > 0.5).astype(int), 3600 * HOURS * share
@@ -132,20 +138,23 @@ def judged(
     then, third = rng.uniform(warmth.min(), warmth.max(), NEW), np.full(NEW, 2)
     # The program's directions are those of the nominal joints; corrections are small beside the ways.
     now = ways(shafts(wanted))
-    told: Told = (kind, warmth, way, share)
-    new: Told = (third, then, now, np.zeros(NEW))
     sent = {"nominal": wanted}
-    for full, who in ((False, "plain script"), (True, "fuller script")):
-        start = clock.time()
+    for full, who in ((False, "plain script"), (True, "fuller, no shafts"), (True, "fuller script")):
+        start, apart = clock.time(), who == "fuller, no shafts"
+        ratios = np.eye(3) if apart else SHAFTS
+        told: Told = (kind, warmth, ways(joints) if apart else way, share, ratios)
+        new: Told = (third, then, ways(wanted) if apart else now, np.zeros(NEW), ratios)
         x, left = fit(joints, told, seen, full)
         sent[who] = corrected(wanted, new, x)
         sent[f"{who} + GP"] = corrected(wanted, new, x, by_process(joints, left, wanted))
         print(f"  {who}: {clock.time() - start:.0f} s, leaves {1e6 * np.sqrt((left**2).sum(1).mean()):.0f}", file=sys.stderr)
     for who in names:
         machine, config, loads, motors = OURS[who]
+        machine = machine.replace("tool_per: [tool]\n", "") if "tools" in without else machine
         start, turn = clock.time(), robot.turn.as_matrix()
-        records = table(joints, kind, warmth, time, loads, motors, turn, seen)
-        targets = table(wanted, third, then, np.zeros(NEW), loads, motors, turn, None)
+        place = prefit(joints, kind, seen) if motors else seen
+        records = table(joints, kind, warmth, time, loads, motors, np.eye(3) if motors else turn, place)
+        targets = table(wanted, third, then, np.zeros(NEW), loads, motors, np.eye(3) if motors else turn, None)
         with TemporaryDirectory() as folder:
             place = Path(folder) if kept is None else kept / str(seed) / who.replace(", ", "_").replace(" ", "_")
             place.mkdir(parents=True, exist_ok=True)
@@ -171,7 +180,7 @@ def main() -> None:
     options.add_argument("--rows", type=int, default=60)
     options.add_argument("--without", nargs="*", choices=CAUSES, default=[])
     options.add_argument("--keep", type=Path)
-    options.add_argument("--ours", default=";".join(OURS), help="names between semicolons")
+    options.add_argument("--ours", default=";".join(list(OURS)[:3]), help="names between semicolons")
     given = options.parse_args()
     names = [name for name in given.ours.split(";") if name]
     every = []

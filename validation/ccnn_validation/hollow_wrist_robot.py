@@ -22,7 +22,7 @@ POINTS = np.array([[0.05, 0.02, 0.25], [-0.06, 0.03, 0.3], [0.03, -0.05, 0.27]])
 LOW, HIGH = np.radians([-60.0, -20, -30, -150, -150, -170]), np.radians([60.0, 45, 40, 150, 150, 170])
 G = 9.81
 CAUSES = (
-    "lengths", "twists", "zeros", "gears", "meshes", "coupling", "weight", "soft_bearing", "backlash", "growth", "stand",
+    "lengths", "twists", "zeros", "gears", "meshes", "coupling", "weight", "soft_bearing", "backlash", "growth", "stand", "tools",
 )  # fmt: skip
 
 
@@ -87,7 +87,9 @@ class Robot:
         self.growth = on["growth"] * np.array([11e-6, 11e-6, 22e-6, 22e-6, 20e-6, 20e-6]) * rng.uniform(0.95, 1.05, 6)
         self.warms = np.array([0.9, 0.7, 1.1, 0.9, 0.7, 0.6]) * rng.uniform(0.85, 1.15, 6)
         self.bends = on["growth"] * size(3e-6, 1.2e-5, 6) * np.array([0.3, 1, 1, 0.5, 0.5, 0.5])
+        # Without "tools" one reflector stays beside the flange, whatever is carried.
         self.points = POINTS + rng.normal(0, 5e-4, (3, 3))
+        self.points = self.points if on["tools"] else self.points[[0, 0, 0]]
         self.turn = Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)])
         level = Rotation.from_rotvec(rng.normal(0, 7e-4, 3))
         self.turn, self.stand = self.turn * level, np.array([*rng.normal(0, 0.5, 2), 0.2]) + [3.6, 0.8, 0]

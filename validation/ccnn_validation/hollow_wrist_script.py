@@ -10,7 +10,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from ccnn_validation.hollow_wrist_robot import (
-    ALPHA, CENTRES, D, GEARS, HIGH, LOW, MASSES, POINTS, SHAFTS, THETA, TOOLS, A, frames, torques,
+    ALPHA, CENTRES, D, GEARS, HIGH, LOW, MASSES, POINTS, THETA, TOOLS, A, frames, torques,
 )  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -24,8 +24,8 @@ GROUPS = {
 }  # fmt: skip
 FULL = ("coupling", "gears", "meshes", "lost", "growth", "bends", "tilt", "drift")
 SOFT = 1 / np.array([8e5, 1e6, 6e5, 1e5, 6e4, 4e4])
-Told = tuple[Array, Array, Array, Array]
-"""Tool's number in each row, warmth beyond 20 deg C, direction of each motor, time as a share of the session."""
+Told = tuple[Array, Array, Array, Array, Array]
+"""Tool in each row, warmth beyond 20 deg C, direction of each motor, time as a share of the session; ratios of shafts."""
 
 
 def split(x: Array) -> dict[str, Array]:
@@ -34,13 +34,21 @@ def split(x: Array) -> dict[str, Array]:
     return dict(zip(GROUPS, np.split(x, ends[:-1]), strict=True))
 
 
+def prefit(joints: Array, kind: Array, seen: Array) -> Array:
+    """Rows in the robot's base by the data sheet alone, best frame and points, `s x 3` [m]."""
+    last = frames(joints, A, np.radians(ALPHA), D, np.radians(THETA))[:, 6]
+    at = (last[:, :3, :3] @ POINTS[kind][..., None])[..., 0] + last[:, :3, 3]
+    turn, _ = Rotation.align_vectors(seen - seen.mean(0), at - at.mean(0))
+    return np.asarray(turn.inv().apply(seen - seen.mean(0)) + at.mean(0))
+
+
 def flange(x: Array, joints: Array, told: Told) -> Array:
     """Frames of the last link in the base, `s x 4 x 4`."""
-    n, (kind, warmth, direction, _) = split(x), told
-    shafts = SHAFTS.copy()
+    n, (kind, warmth, direction, _, given) = split(x), told
+    shafts = given.copy()
     shafts[[1, 2, 2], [0, 0, 1]] += n["coupling"]
     inverse, motors = np.linalg.inv(shafts), joints.copy()
-    motors[:, 3:] = joints[:, 3:] @ SHAFTS.T
+    motors[:, 3:] = joints[:, 3:] @ given.T
     grown = warmth[:, None] * n["growth"][[0, 0, 1, 1, 1, 1]] + 1
     links = (A + n["a"]) * grown, np.radians(ALPHA) + n["alpha"], (D + n["d"]) * grown, np.radians(THETA) + n["theta"]
     mass = np.array([TOOLS[int(k)][0] for k in kind])
