@@ -6,10 +6,12 @@ stand the temperature of the arm, the payload and each axis' last direction. The
 lengths, twists, zeros, reducers once and twice a motor's turn and bevel gears in the wrist, each on the shafts it sits
 on, ratios of coupling a little off, joints and a bearing that give under weight, lost motion, growth, a stand that
 drifts. Ours (`ccnn run`, by the written file) has the Denavit-Hartenberg table; "sheet" also gears, masses and centres,
-"loads" also the moments of the tools, "shafts" (only `--without tools`, one reflector for both) the user's own class
-`hollow_wrist_shafts.Wrist` whose joints are the turns of the motors. The plain SciPy script (`hollow_wrist_script`) has lengths, twists, zeros and soft joints, the
-fuller one all causes ("no shafts": each on its joint); also with a Gaussian process on what is left. Judged another day with a tool of 8 kg, in the frame
-and at the tool point that suit best, RMS and largest [µm]; "of a reading" is what a reading is off. `--without NAME` of
+"loads" also the moments of the tools, "ways" has directions of motors in the place of axes', "shafts" (only
+`--without tools`, one reflector for both) the user's own class `hollow_wrist_shafts.Wrist` whose joints are turns of the
+motors. The plain SciPy script (`hollow_wrist_script`) has lengths, twists, zeros and soft joints, the fuller one all
+causes ("no shafts": each on its joint; "signs": lost motion by direction alone, whatever the weight); also with a
+Gaussian process on what is left. Judged another day with a tool of 8 kg, in the frame and at the tool point that suit
+best, RMS and largest [µm]; "of a reading" is what a reading is off. `--without NAME` of
 `CAUSES` switches a true error off, `--keep FOLDER` keeps the files, `--ours NAMES` chooses of `OURS`.
 """
 
@@ -64,8 +66,16 @@ OURS = {
     "ours": (ARM, PLAIN, False, False),
     "ours, sheet": (SHEET, PLAIN, False, False),
     "ours, loads": (SHEET, PLAIN, True, False),
+    "ours, ways": (SHEET, PLAIN, False, False),
     "ours, shafts": (WRIST, GEARED, True, True),
 }
+SCRIPTS = (
+    (False, "plain script"),
+    (True, "fuller, no shafts, signs"),
+    (True, "fuller, no shafts"),
+    (True, "fuller, signs"),
+    (True, "fuller script"),
+)
 
 
 def day(rows: int, rng: np.random.Generator, share: float = 1.0) -> Array:
@@ -99,12 +109,20 @@ def missed(wanted: Array, reached: Array) -> list[float]:
 
 
 def table(
-    joints: Array, kind: Array, warmth: Array, time: Array, loads: bool, motors: bool, turn: Array, seen: Array | None
+    joints: Array,
+    kind: Array,
+    warmth: Array,
+    time: Array,
+    way: Array,
+    loads: bool,
+    motors: bool,
+    turn: Array,
+    seen: Array | None,
 ) -> tuple[str, Array]:
     """Header and rows of a file; `turn`: of the robot in the tracker's frame, for loads by the data sheet."""
     shown = shafts(joints) if motors else joints
     names = [f"q{k}[deg]" for k in range(1, 7)] + [f"direction{k}[1]" for k in range(1, 7)] + ["temperature[degC]"]
-    parts = [np.degrees(shown), ways(shown), (20 + warmth)[:, None]]
+    parts = [np.degrees(shown), way, (20 + warmth)[:, None]]
     mass = np.array([TOOLS[int(k)][0] for k in kind])
     if loads:
         last = frames(joints, A, np.radians(ALPHA), D, np.radians(THETA))[:, 6]
@@ -139,22 +157,29 @@ def judged(
     # The program's directions are those of the nominal joints; corrections are small beside the ways.
     now = ways(shafts(wanted))
     sent = {"nominal": wanted}
-    for full, who in ((False, "plain script"), (True, "fuller, no shafts"), (True, "fuller script")):
-        start, apart = clock.time(), who == "fuller, no shafts"
-        ratios = np.eye(3) if apart else SHAFTS
-        told: Told = (kind, warmth, ways(joints) if apart else way, share, ratios)
-        new: Told = (third, then, ways(wanted) if apart else now, np.zeros(NEW), ratios)
+    for full, who in SCRIPTS:
+        start, apart = clock.time(), who.startswith("fuller, no shafts")
+        ratios, holds = np.eye(3) if apart else SHAFTS, 1e6 if "signs" in who else 1.0
+        told: Told = (kind, warmth, ways(joints) if apart else way, share, ratios, holds)
+        new: Told = (third, then, ways(wanted) if apart else now, np.zeros(NEW), ratios, holds)
         x, left = fit(joints, told, seen, full)
         sent[who] = corrected(wanted, new, x)
         sent[f"{who} + GP"] = corrected(wanted, new, x, by_process(joints, left, wanted))
-        print(f"  {who}: {clock.time() - start:.0f} s, leaves {1e6 * np.sqrt((left**2).sum(1).mean()):.0f}", file=sys.stderr)
+        print(
+            f"  {who}: {clock.time() - start:.0f} s, leaves {1e6 * np.sqrt((left**2).sum(1).mean()):.0f}",
+            file=sys.stderr,
+        )
     for who in names:
         machine, config, loads, motors = OURS[who]
         machine = machine.replace("tool_per: [tool]\n", "") if "tools" in without else machine
         start, turn = clock.time(), robot.turn.as_matrix()
         place = prefit(joints, kind, seen) if motors else seen
-        records = table(joints, kind, warmth, time, loads, motors, np.eye(3) if motors else turn, place)
-        targets = table(wanted, third, then, np.zeros(NEW), loads, motors, np.eye(3) if motors else turn, None)
+        turned = motors or who == "ours, ways"
+        ended = [ways(shafts(q) if turned else q) for q in (joints, wanted)]
+        records = table(joints, kind, warmth, time, ended[0], loads, motors, np.eye(3) if motors else turn, place)
+        targets = table(
+            wanted, third, then, np.zeros(NEW), ended[1], loads, motors, np.eye(3) if motors else turn, None
+        )
         with TemporaryDirectory() as folder:
             place = Path(folder) if kept is None else kept / str(seed) / who.replace(", ", "_").replace(" ", "_")
             place.mkdir(parents=True, exist_ok=True)

@@ -46,7 +46,9 @@ def frames(joints: Array, a: Array, alpha: Array, d: Array, theta: Array, lean: 
 def torques(chain: Array, masses: Array, centres: Array, tool: Array, centre: Array, down: Array) -> Array:
     """What weight turns each joint with [Nm], `s x 6`; `tool`: its mass in each row, and its centre `s x 3`."""
     places = chain[:, 1:, :3, 3] + (chain[:, 1:, :3, :3] @ centres[..., None])[..., 0]
-    places = np.concatenate([places, (chain[:, 6, :3, 3] + (chain[:, 6, :3, :3] @ centre[..., None])[..., 0])[:, None]], 1)
+    places = np.concatenate(
+        [places, (chain[:, 6, :3, 3] + (chain[:, 6, :3, :3] @ centre[..., None])[..., 0])[:, None]], 1
+    )
     weights = np.c_[np.tile(masses, (len(chain), 1)), tool]
     found = np.zeros((len(chain), 6))
     for k in range(6):
@@ -67,11 +69,17 @@ class Robot:
 
         self.a, self.d = A + on["lengths"] * size(5e-5, 5e-4, 6), D + on["lengths"] * size(5e-5, 5e-4, 6)
         self.alpha = np.radians(ALPHA) + on["twists"] * size(5e-5, 4e-4, 6)
-        self.lean, self.theta = on["twists"] * float(size(5e-5, 3e-4)), np.radians(THETA) + on["zeros"] * size(2e-4, 1.2e-3, 6)
+        self.lean, self.theta = (
+            on["twists"] * float(size(5e-5, 3e-4)),
+            np.radians(THETA) + on["zeros"] * size(2e-4, 1.2e-3, 6),
+        )
         # Reducers, at each motor's turn and twice: 15 to 40 arcsec from peak to peak, by phases of their own [rad].
         self.once, self.twice = on["gears"] * rng.uniform(3.5e-5, 1e-4, 6), on["gears"] * rng.uniform(1.5e-5, 5e-5, 6)
         # Bevel gears in the wrist, once a turn of the wheel and of its pinion: run-out of 10 to 20 µm on 60 mm.
-        self.wheel, self.pinion = on["meshes"] * rng.uniform(8e-5, 1.8e-4, 2), on["meshes"] * rng.uniform(5e-5, 1.2e-4, 2)
+        self.wheel, self.pinion = (
+            on["meshes"] * rng.uniform(8e-5, 1.8e-4, 2),
+            on["meshes"] * rng.uniform(5e-5, 1.2e-4, 2),
+        )
         self.phase = rng.uniform(0, 2 * np.pi, (4, 6))
         self.shafts = SHAFTS.copy()
         self.shafts[[1, 2, 2], [0, 0, 1]] += on["coupling"] * size(1e-4, 4e-4, 3)
@@ -117,7 +125,11 @@ class Robot:
         for _ in range(4):
             turned = motors + self.once * np.sin(GEARS * motors + self.phase[0])
             turned = turned + self.twice * np.sin(2 * GEARS * motors + self.phase[1])
-            turned = turned + self.soft * load + self.lost / 2 * np.tanh((load - self.holds * direction) / (0.3 * self.holds))
+            turned = (
+                turned
+                + self.soft * load
+                + self.lost / 2 * np.tanh((load - self.holds * direction) / (0.3 * self.holds))
+            )
             true = turned + self.bends * own
             true[:, 3:] = turned[:, 3:] @ inverse.T + self.bends[3:] * own[:, 3:]
             for k in (0, 1):

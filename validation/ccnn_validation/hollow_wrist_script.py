@@ -24,8 +24,9 @@ GROUPS = {
 }  # fmt: skip
 FULL = ("coupling", "gears", "meshes", "lost", "growth", "bends", "tilt", "drift")
 SOFT = 1 / np.array([8e5, 1e6, 6e5, 1e5, 6e4, 4e4])
-Told = tuple[Array, Array, Array, Array, Array]
-"""Tool in each row, warmth beyond 20 deg C, direction of each motor, time as a share of the session; ratios of shafts."""
+Told = tuple[Array, Array, Array, Array, Array, float]
+"""Tool in each row, warmth beyond 20 deg C, direction of each motor, time as a share of the session; ratios of shafts, and
+by how much friction is held above `HOLDS`."""
 
 
 def split(x: Array) -> dict[str, Array]:
@@ -44,7 +45,7 @@ def prefit(joints: Array, kind: Array, seen: Array) -> Array:
 
 def flange(x: Array, joints: Array, told: Told) -> Array:
     """Frames of the last link in the base, `s x 4 x 4`."""
-    n, (kind, warmth, direction, _, given) = split(x), told
+    n, (kind, warmth, direction, _, given, more) = split(x), told
     shafts = given.copy()
     shafts[[1, 2, 2], [0, 0, 1]] += n["coupling"]
     inverse, motors = np.linalg.inv(shafts), joints.copy()
@@ -60,7 +61,7 @@ def flange(x: Array, joints: Array, told: Told) -> Array:
     for k in (0, 1):
         turns = (k + 1) * GEARS * motors
         turned = turned + waves[2 * k] * np.sin(turns) + waves[2 * k + 1] * np.cos(turns)
-    turned = turned + n["lost"] / 2 * np.tanh((load - HOLDS * direction) / (0.3 * HOLDS))
+    turned = turned + n["lost"] / 2 * np.tanh((load / more - HOLDS * direction) / (0.3 * HOLDS))
     true = turned + n["bends"] * warmth[:, None]
     true[:, 3:] = turned[:, 3:] @ inverse.T + n["bends"][3:] * warmth[:, None]
     for k, mesh in enumerate(n["meshes"].reshape(2, 4)):
@@ -104,7 +105,9 @@ def fit(joints: Array, told: Told, seen: Array, full: bool) -> tuple[Array, Arra
     found = least_squares(residuals, np.zeros(len(free)), method="trf", x_scale="jac", max_nfev=60).x
     x = start.copy()
     x[free] += found * size[free]
-    return x, (Rotation.from_rotvec(split(x)["base"][3:] * 1e-2) * turn).inv().apply(seen - seen_by(x, joints, told, turn))
+    return x, (Rotation.from_rotvec(split(x)["base"][3:] * 1e-2) * turn).inv().apply(
+        seen - seen_by(x, joints, told, turn)
+    )
 
 
 def corrected(wanted: Array, told: Told, x: Array, more: Array | float = 0.0) -> Array:

@@ -59,7 +59,9 @@ class Wrist(Mechanism):
             geometry += [Parameter(f"alpha{k + 1}", "rad", torch.pi / 180 * ALPHA[k])]
             geometry += [Parameter(f"theta{k + 1}", "rad", torch.pi / 180 * THETA[k])]
         geometry.append(Parameter("lean3", "rad", 0.0))
-        geometry += [Parameter(f"ratio{i + 1}{k + 1}", "1", r, scale=3e-4) for (i, k), r in zip(CELLS, RATIOS, strict=True)]
+        geometry += [
+            Parameter(f"ratio{i + 1}{k + 1}", "1", r, scale=3e-4) for (i, k), r in zip(CELLS, RATIOS, strict=True)
+        ]
         geometry += [Parameter(f"stand_{k}", "m", 0.0, scale=1e-3) for k in "xyz"]
         geometry += [Parameter(f"stand_r{k}", "rad", 0.0, scale=1e-3) for k in "xyz"]
         geometry += [Parameter(f"point_{k}", "m", p) for k, p in zip("xyz", POINT, strict=True)]
