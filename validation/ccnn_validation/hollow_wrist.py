@@ -1,13 +1,13 @@
 """A painting robot of 2 m reach with a hollow wrist, whose motors 4 to 6 are coupled by shafts within shafts.
 
-`python -m ccnn_validation.hollow_wrist --seed N [--machines N] [--rows N]`. A laser tracker reads x, y, z of a reflector
+`python -m ccnn_validation.hollow_wrist --seed N [--machines N] [--rows N]`. A laser tracker reads x, y, z of a mirror
 over three hours while robot and stand warm: half of the rows with a tool of 3 kg, half with one of 13 kg. Beside them
 stand the temperature of the arm, the payload and each axis' last direction. The true machine (`hollow_wrist_robot`):
 lengths, twists, zeros, reducers once and twice a motor's turn and bevel gears in the wrist, each on the shafts it sits
 on, ratios of coupling a little off, joints and a bearing that give under weight, lost motion, growth, a stand that
 drifts. Ours (`ccnn run`, by the written file) has the Denavit-Hartenberg table; "sheet" also gears, masses and centres,
 "loads" also the moments of the tools, "ways" has directions of motors in the place of axes', "shafts" (only
-`--without tools`, one reflector for both) the user's own class `hollow_wrist_shafts.Wrist` whose joints are turns of the
+`--without tools`, one mirror for both) the user's own class `hollow_wrist_shafts.Wrist` whose joints are turns of the
 motors. The plain SciPy script (`hollow_wrist_script`) has lengths, twists, zeros and soft joints, the fuller one all
 causes ("no shafts": each on its joint; "signs": lost motion by direction alone, whatever the weight); also with a
 Gaussian process on what is left. Judged another day with a tool of 8 kg, in the frame and at the tool point that suit
@@ -31,7 +31,22 @@ from scipy.spatial.transform import Rotation
 
 from ccnn_validation.drawn import commanded
 from ccnn_validation.hollow_wrist_robot import (
-    ALPHA, CAUSES, CENTRES, D, GEARS, HIGH, LOW, MASSES, POINTS, SHAFTS, THETA, TOOLS, A, G, Robot, frames,
+    ALPHA,
+    CAUSES,
+    CENTRES,
+    GEARS,
+    HIGH,
+    LOW,
+    MASSES,
+    POINTS,
+    SHAFTS,
+    THETA,
+    TOOLS,
+    A,
+    D,
+    G,
+    Robot,
+    frames,
 )  # fmt: skip
 from ccnn_validation.hollow_wrist_script import Told, by_process, corrected, fit, prefit
 

@@ -1,4 +1,4 @@
-"""A painting robot of 2 m reach with a hollow wrist, as it is built: axes 5 and 6 lean, and shafts in shafts drive them."""
+"""A painting robot with a hollow wrist as it is built: axes 5 and 6 lean, and shafts in shafts drive them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ POINTS = np.array([[0.05, 0.02, 0.25], [-0.06, 0.03, 0.3], [0.03, -0.05, 0.27]])
 LOW, HIGH = np.radians([-60.0, -20, -30, -150, -150, -170]), np.radians([60.0, 45, 40, 150, 150, 170])
 G = 9.81
 CAUSES = (
-    "lengths", "twists", "zeros", "gears", "meshes", "coupling", "weight", "soft_bearing", "backlash", "growth", "stand", "tools",
+    "lengths", "twists", "zeros", "gears", "meshes", "coupling", "weight", "soft_bearing", "backlash", "growth",
+    "stand", "tools",
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""What an engineer writes in SciPy for the robot with the hollow wrist: its numbers by the data sheet, least squares."""
+"""What an engineer writes in SciPy for the robot with the hollow wrist: its data sheet and least squares."""
 
 from __future__ import annotations
 
@@ -10,7 +10,19 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from ccnn_validation.hollow_wrist_robot import (
-    ALPHA, CENTRES, D, GEARS, HIGH, LOW, MASSES, POINTS, THETA, TOOLS, A, frames, torques,
+    ALPHA,
+    CENTRES,
+    GEARS,
+    HIGH,
+    LOW,
+    MASSES,
+    POINTS,
+    THETA,
+    TOOLS,
+    A,
+    D,
+    frames,
+    torques,
 )  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -25,8 +37,8 @@ GROUPS = {
 FULL = ("coupling", "gears", "meshes", "lost", "growth", "bends", "tilt", "drift")
 SOFT = 1 / np.array([8e5, 1e6, 6e5, 1e5, 6e4, 4e4])
 Told = tuple[Array, Array, Array, Array, Array, float]
-"""Tool in each row, warmth beyond 20 deg C, direction of each motor, time as a share of the session; ratios of shafts, and
-by how much friction is held above `HOLDS`."""
+"""Tool in each row, warmth beyond 20 deg C, direction of each motor, time as a share of the session; ratios of shafts,
+and by how much friction is held above `HOLDS`."""
 
 
 def split(x: Array) -> dict[str, Array]:

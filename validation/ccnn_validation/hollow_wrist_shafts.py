@@ -1,4 +1,4 @@
-"""The robot with the hollow wrist for the program: its joints 4 to 6 are the turns of the motors, each over its gear."""
+"""The robot with the hollow wrist for the program: its joints 4 to 6 are turns of motors, each over its gear."""
 
 from __future__ import annotations
 
