@@ -173,7 +173,8 @@ def _wanted(prepared: Prepared, repeat: int) -> Tensor | None:
     if nominal is None or prepared.physics is None:
         return nominal
     if mechanism.grouped:
-        of_set_ups = ("base_",) * bool(mechanism.frame_per) + ("tool_",) * bool(mechanism.tool_per)
+        # A file of such a machine is in its own base, whatever the groups differ in.
+        of_set_ups = ("base_", *("tool_",) * bool(mechanism.tool_per))
         own = torch.tensor([p.name.startswith(of_set_ups) for p in mechanism.geometry])
         return torch.where(own, prepared.physics.values[repeat], nominal)
     if not isinstance(mechanism, Seen):

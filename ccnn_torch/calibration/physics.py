@@ -138,6 +138,10 @@ class Physics:
         # not known.
         same = (len(a.effect.coefficients(there.whole)) == len(a.coefficients) for a in self.acting[repeat])
         there = there.visits if all(same) else there
+        arm = there.mechanism
+        if isinstance(arm, SerialArm) and arm.orientation == "none":
+            # Another tool is right only where the orientation is.
+            there = replace(there, mechanism=arm.with_orientation("rotation_vector"), guess=None)
         values = values[: len(there.mechanism.geometry)]
         return machine_of(there, self.acting[repeat], values, covariates, margin)
 
