@@ -391,10 +391,22 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
         if isinstance(situation.mechanism, Instrument):
             situation = situation.visits
             values = values[..., : len(situation.mechanism.geometry)]
+        situation = with_orientation(situation)
         return found_block(situation, values, acting, covariate_units(situation.mechanism, used))
     except InputError:
         # A machine that no file describes, or an effect that needs what was before a row.
         return None
+
+
+def with_orientation(situation: Situation) -> Situation:
+    """Rows of an arm of which positions were measured, on the arm with its whole pose; others as they are.
+
+    Another tool is at its place only where the orientation is right as well.
+    """
+    arm = situation.mechanism
+    if not isinstance(arm, SerialArm) or arm.orientation != "none":
+        return situation
+    return replace(situation, mechanism=arm.with_orientation("rotation_vector"), guess=None)
 
 
 def _is_beside(acting: Acting) -> bool:

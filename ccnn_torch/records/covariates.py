@@ -22,7 +22,11 @@ DEFAULT_COVARIATES = ("time", "temperature", "temperature_*", "load_*", "torque_
 
 
 def choose_covariates(
-    table: Table, joints: Sequence[Coordinate], pose: Mapping[str, str], wanted: Sequence[str] | None
+    table: Table,
+    joints: Sequence[Coordinate],
+    pose: Mapping[str, str],
+    wanted: Sequence[str] | None,
+    groups: Sequence[str] = (),
 ) -> tuple[tuple[Coordinate, ...], list[str]]:
     """Choose the covariates of a table.
 
@@ -31,6 +35,7 @@ def choose_covariates(
         joints: the columns that are joints; none of them may be a covariate.
         pose: SI unit of the columns that are pose, likewise.
         wanted: names or patterns (``load_*``) instead of the default ones; None = the default ones that are there.
+        groups: columns that number groups of rows for the mechanism, which are not ignored.
 
     Returns:
         Covariates in the file's order, constant ones left out, and notes on what was left out and why.
@@ -57,7 +62,7 @@ def choose_covariates(
         else:
             covariates.append(coordinate)
     # The column that numbers several files was added by this package, and what a payload weighs is another column.
-    read = ([FILE] if table.parts else []) + ([PAYLOAD] if "load_z" in table else [])
+    read = [*groups, *[FILE] * bool(table.parts), *[PAYLOAD] * ("load_z" in table)]
     ignored = [name for name in free if name not in chosen and name not in read]
     if ignored:
         notes.append(f"ignored columns: {', '.join(ignored)}; name them in covariates to use them as inputs")

@@ -176,6 +176,49 @@ def test_a_run_corrects_an_arm_that_was_measured_in_several_set_ups(tools: int, 
     assert left < 6e-5 and left < 0.1 * before
 
 
+def test_positions_of_two_tools_correct_the_arm_with_either(tmp_path: Path) -> None:
+    """What is judged is what the file commands, in its own base; and the orientation, or one tool alone is right."""
+    errors = _measured(tmp_path, 5, turned=False)
+    table = np.loadtxt(tmp_path / "r.csv", delimiter=",", skiprows=1)
+    header = (tmp_path / "r.csv").read_text().partition("\n")[0]
+    np.savetxt(tmp_path / "one.csv", table[table[:, -2] == 1], "%.17g", ",", header=header, comments="")
+    (tmp_path / "arm.yaml").write_text(ARM + "tool_per: [tool]\n")
+    keys = {"records": str(tmp_path / "one.csv"), "mechanism": str(tmp_path / "arm.yaml"), "methods": ["constant"]}
+    found = calibrate(RunConfig.from_keys(**keys, geometry="identify", effects="none"))
+    position = found.results.pose.position
+    assert position.before.rms.median is not None and position.after.rms.median is not None
+    assert position.after.rms.median < 0.3 * position.before.rms.median
+    assert not any("tool" in note for note in found.results.notes if note.startswith("ignored columns"))
+    q = np.random.default_rng(3).uniform(-1.5, 1.5, (60, 6))
+    solved = found.compensator().solve(torch.from_numpy(q), torch.zeros(60, 0, dtype=torch.float64))
+    exact = (solved.status == 0).numpy()
+    assert exact.sum() > 30
+    for tool in TOOLS:
+        wanted, as_it_is, corrected = (
+            np.array([(_flange(v, e) @ _frame(tool))[:3, 3] for v in at[exact]])
+            for e, at in ((0 * errors, q), (errors, q), (errors, solved.command.numpy()))
+        )
+        # Which point of the flange a reflector marks is not known to a mm, so that it turns with the flange.
+        turns = np.array([(_flange(v, 0 * errors))[:3, :3] for v in q[exact]])
+        assert _apart_with_tool(corrected, wanted, turns) < 0.15 * _apart_with_tool(as_it_is, wanted, turns)
+
+
+def _apart_with_tool(one: Array, other: Array, turns: Array) -> float:
+    """As `_apart`, with the best shift in the frame of the flange, whose turns are given."""
+    here = one
+    for _ in range(20):
+        there = other + np.einsum("sij,j->si", turns, _shift(here, other, turns))
+        turn = Rotation.align_vectors(there - there.mean(0), here - here.mean(0))[0]
+        here = turn.apply(here - here.mean(0)) + there.mean(0)
+    return float(np.sqrt(((here - there) ** 2).sum(1).mean()))
+
+
+def _shift(here: Array, there: Array, turns: Array) -> Array:
+    """Of the tool, beside one of the base, by least squares, `3`."""
+    columns = np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape)], -1).reshape(-1, 6)
+    return np.asarray(np.linalg.lstsq(columns, (here - there).ravel(), rcond=None)[0][:3])
+
+
 def _apart(one: Array, other: Array) -> float:
     """RMS of what a rigid motion leaves between points (Kabsch)."""
     here, there = one - one.mean(0), other - other.mean(0)
