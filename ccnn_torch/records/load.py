@@ -237,9 +237,8 @@ def load_records(
     used = {joint.name for joint in mechanism.joints} | set(read)
     # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
-    chosen, notes = choose_covariates(
-        table, mechanism.joints, measured, covariates, [*mechanism.frame_per, *mechanism.tool_per]
-    )
+    groups = [name for key in ("frame_per", "tool_per") for name in getattr(mechanism, key, ())]
+    chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates, groups)
     doubt = "; ".join(filter(None, [doubt, _beyond_limits(mechanism, joints), _half_signs(table, chosen)]))
     unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
     lacking = {c.name for c in mechanism.pose} - {c.name for c in coordinates}
