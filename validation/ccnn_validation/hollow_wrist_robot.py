@@ -101,7 +101,7 @@ class Robot:
         self.points = self.points if on["tools"] else self.points[[0, 0, 0]]
         self.turn = Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)])
         level = Rotation.from_rotvec(rng.normal(0, 7e-4, 3))
-        self.turn, self.stand = self.turn * level, np.array([*rng.normal(0, 0.5, 2), 0.2]) + [3.6, 0.8, 0]
+        self.turn, self.stand = self.turn * level, np.array([*rng.normal(0, 0.5, 2), 0.2]) + np.array([3.6, 0.8, 0])
         # The foot is not quite plumb.
         self.down = Rotation.from_rotvec(rng.normal(0, 1e-3, 3)).apply([0.0, 0, -1])
         self.drift = on["stand"] * size(1.5e-5, 6e-5, 3), on["stand"] * size(4e-6, 1.5e-5, 3)
