@@ -213,6 +213,9 @@ def squares(said: Diagnosis, repair: Repair) -> Tensor:
     if repair.nominal is not None and repair.values is not None:
         frames = dict(zip((g.name for g in here.mechanism.geometry), values.unbind(-1), strict=True))
         here = replace(here, mechanism=repair.nominal, parameters=None)
+        # Of an arm's positions the machine is corrected as a whole.
+        unseen = len(here.mechanism.pose) - measured.shape[-1]
+        measured = torch.cat([measured, torch.full((len(measured), unseen), torch.nan, dtype=measured.dtype)], -1)
         start = dict(zip((g.name for g in here.mechanism.geometry), repair.values, strict=True))
         start |= {n: v for n, v in frames.items() if n.partition("_")[0] in unknown}
         values = torch.stack([*start.values()], -1)
