@@ -41,7 +41,8 @@ class Thermal(Effect):
     parts by what it shows beyond the first one, and of drives and mounts by what it shows itself, each there or not for
     itself: a leg, or a screw, grows by its own thermometer. Lengths that every leg has one of may grow together, as a
     base plate does. Without `temperature` the mean of the others stands for it; where none was recorded at all, but the
-    time, the surroundings are taken to have become 10 K warmer at the first row: growth that settles.
+    time, the surroundings are taken to have become 10 K warmer at the first row: growth that settles, without what
+    moves one turning joint alone.
 
     Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
     derivatives, so the effect is one on the pose: no joint has to replace a length (near a singularity of an arm
@@ -61,8 +62,12 @@ class Thermal(Effect):
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """The whole machine, its members, its sliding drives; then what is secondary."""
+        every = self._every(situation)
+        return tuple(every[k] for k in _kept(situation, every))
+
+    def _every(self, situation: Situation) -> list[Coefficient]:
         mechanism = situation.mechanism
-        recorded = any(map(is_temperature, situation.covariates))
+        recorded = _recorded(situation)
         found = [Coefficient("growth", "1/K", _STEEL, positive=recorded)]
         uneven = _STEEL * _UNEVEN
         found += [Coefficient(m.name, "1/K", uneven, joint=m.joint, leg=m.leg) for m in _apart(mechanism)]
@@ -108,7 +113,7 @@ class Thermal(Effect):
             for name in situation.thermometers
             for c in (*following, *bodies, *drives)
         ]
-        return tuple(found)
+        return found
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """The lag, from none to the time of all rows; () without times."""
@@ -119,7 +124,7 @@ class Thermal(Effect):
         lags = [math.exp(low + (high - low) * k / (_LAGS - 1)) for k in range(_LAGS)]
         mechanism, names = situation.mechanism, [c.name for c in self.coefficients(situation)]
         # By place: a plate may have a thermometer, and its growth a name that ends alike.
-        late = range(names.index("at once") + 1, len(names))
+        late = range(names.index("late"), len(names))
         late = late[: 1 + len(_apart(mechanism)) + 2 * sum(j.unit == "m" for j in mechanism.joints)]
         others = tuple(k for k in range(len(names)) if k not in late)
         return Shape("lag", "s", (0.0, *lags), others), Shape("late lag", "s", tuple(lags), tuple(late))
@@ -143,7 +148,8 @@ class Thermal(Effect):
         timed = [whole, *following, jacobian[..., sliding], jacobian, *following] if _timed(situation) else []
         bodies = [longer[..., p.lengths].sum(-1, keepdim=True) for p in like_parts(mechanism)]
         others = [whole, *apart, *bodies, travel, jacobian] * len(situation.thermometers)
-        return torch.cat([*following, jacobian, whole, *timed, *bodies, *others], -1)
+        every = torch.cat([*following, jacobian, whole, *timed, *bodies, *others], -1)
+        return every[..., _kept(situation, self._every(situation))]
 
     def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
         """What each of the fixed columns is multiplied by: warmth [K], or what has become of it, `... x s x m`."""
@@ -165,7 +171,8 @@ class Thermal(Effect):
             # A screw is as warm as its own thermometer; what a leg's shows is beside the growth of the whole machine.
             kinds += [(other - body, following - sliding + bodies), (other, sliding + n)]
         each = torch.stack(torch.broadcast_tensors(*(k for k, _ in kinds)), -1)  # type: ignore[no-untyped-call]
-        return each[..., [i for i, (_, count) in enumerate(kinds) for _ in range(count)]]
+        columns = [i for i, (_, count) in enumerate(kinds) for _ in range(count)]
+        return each[..., [columns[k] for k in _kept(situation, self._every(situation))]]
 
 
 def _mount(unit: str, reach: float) -> float:
@@ -173,9 +180,21 @@ def _mount(unit: str, reach: float) -> float:
     return max(_MOUNT[unit], _STEEL * reach) if unit == "m" else _MOUNT[unit]
 
 
+def _recorded(situation: Situation) -> bool:
+    return any(map(is_temperature, situation.covariates))
+
+
+def _kept(situation: Situation, every: Sequence[Coefficient]) -> list[int]:
+    """Numbers of the coefficients that a temperature shows; in time alone what moves one joint is its drift."""
+    if _recorded(situation):
+        return [*range(len(every))]
+    others = ("reference", "at once", "bend", "warm-up")
+    return [k for k, c in enumerate(every) if not c.name.endswith(others) and c.unit != "rad/K"]
+
+
 def _warmth(situation: Situation) -> Tensor:
     """Of the surroundings beyond the reference, `... x s` [K]."""
-    if any(map(is_temperature, situation.covariates)):
+    if _recorded(situation):
         return situation.temperature.expand(situation.joints.shape[:-1]) - REFERENCE
     return _RISE * (elapsed(situation.covariates["time"]).expand(situation.joints.shape[:-1]) > 0)
 
