@@ -139,7 +139,9 @@ def test_a_cause_that_nothing_recorded_shows_is_not_passed_off_as_noise() -> Non
 def test_the_temperature_is_asked_for_first_where_the_rest_follows_the_time() -> None:
     rows = rows_of("five_bar", 150, 8)
     poses = measured(rows, {"thermal": 12.0}, 9)
-    said = diagnose_rows(_without(rows, "temperature"), poses, None, ["geometry", "compliance", "thermal", "backlash"])
+    # Growth itself would be named by its course in time.
+    effects = ["geometry", "compliance", "thermal_compliance", "backlash"]
+    said = diagnose_rows(_without(rows, "temperature"), poses, None, effects)
     assert said.verdict["outside_library"] and said.verdict["driver"] == "time"
     assert said.missing_covariates[0]["columns"] == ["temperature[degC]"]
 
