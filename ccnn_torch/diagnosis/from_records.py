@@ -401,10 +401,11 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
 def with_orientation(situation: Situation) -> Situation:
     """Rows of an arm of which positions were measured, on the arm with its whole pose; others as they are.
 
-    Another tool is at its place only where the orientation is right as well.
+    Another tool is at its place only where the orientation is right as well. Three joints or fewer are all needed for
+    the position.
     """
     arm = situation.mechanism
-    if not isinstance(arm, SerialArm) or arm.orientation != "none":
+    if not isinstance(arm, SerialArm) or arm.orientation != "none" or len(arm.joints) < 4:
         return situation
     return replace(situation, mechanism=arm.with_orientation("rotation_vector"), guess=None)
 

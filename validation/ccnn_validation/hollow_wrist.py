@@ -103,7 +103,7 @@ def day(rows: int, rng: np.random.Generator, share: float = 1.0) -> Array:
 
 def shafts(joints: Array) -> Array:
     """Turns of the motors, each over its gear."""
-    return np.c_[joints[:, :3], joints[:, 3:] @ SHAFTS.T]
+    return np.asarray(np.c_[joints[:, :3], joints[:, 3:] @ SHAFTS.T])
 
 
 def ways(joints: Array) -> Array:
@@ -188,10 +188,10 @@ def judged(
         machine, config, loads, motors = OURS[who]
         machine = machine.replace("tool_per: [tool]\n", "") if "tools" in without else machine
         start, turn = clock.time(), robot.turn.as_matrix()
-        place = prefit(joints, kind, seen) if motors else seen
+        rows_seen = prefit(joints, kind, seen) if motors else seen
         turned = motors or who == "ours, ways"
         ended = [ways(shafts(q) if turned else q) for q in (joints, wanted)]
-        records = table(joints, kind, warmth, time, ended[0], loads, motors, np.eye(3) if motors else turn, place)
+        records = table(joints, kind, warmth, time, ended[0], loads, motors, np.eye(3) if motors else turn, rows_seen)
         targets = table(
             wanted, third, then, np.zeros(NEW), ended[1], loads, motors, np.eye(3) if motors else turn, None
         )
@@ -204,12 +204,12 @@ def judged(
             found = np.c_[found[:, :3], found[:, 3:] @ np.linalg.inv(SHAFTS).T]
         sent[who] = np.full_like(wanted, np.nan) if found is None else found
         print(f"  {who}: {clock.time() - start:.0f} s", file=sys.stderr)
-    found = {}
+    off: dict[str, list[float]] = {}
     for who, q in sent.items():
         bad = np.isnan(q).any()
-        found[who] = [np.nan] * 2 if bad else missed(wanted, robot.reached(q, third, then, now))
+        off[who] = [np.nan] * 2 if bad else missed(wanted, robot.reached(q, third, then, now))
     quiet = robot.turn.apply(robot.reached(joints, kind, warmth, way)) + robot.stand
-    return found | {"of a reading": [float(np.sqrt(((seen - quiet) ** 2).sum(1).mean())), 0.0]}
+    return off | {"of a reading": [float(np.sqrt(((seen - quiet) ** 2).sum(1).mean())), 0.0]}
 
 
 def main() -> None:

@@ -23,14 +23,14 @@ def about(axis: int, angle: Tensor) -> Tensor:
         1: (c, zero, s, zero, zero, one, zero, zero, -s, zero, c, zero),
         2: (c, -s, zero, zero, s, c, zero, zero, zero, zero, one, zero),
     }[axis]
-    return torch.stack([*rows, zero, zero, zero, one], -1).unflatten(-1, (4, 4))
+    return torch.stack([*rows, zero, zero, zero, one], -1).reshape(*angle.shape, 4, 4)
 
 
 def along(x: Tensor, z: Tensor) -> Tensor:
     """Shift along x and z, `... x 4 x 4`."""
     one, zero = torch.ones_like(x), torch.zeros_like(x)
     cells = (one, zero, zero, x, zero, one, zero, zero, zero, zero, one, z, zero, zero, zero, one)
-    return torch.stack(cells, -1).unflatten(-1, (4, 4))
+    return torch.stack(cells, -1).reshape(*x.shape, 4, 4)
 
 
 def vector(matrix: Tensor) -> Tensor:
@@ -41,7 +41,7 @@ def vector(matrix: Tensor) -> Tensor:
     a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     p, q, r = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2]
     w, x, y, z = four.unbind(-1)
-    every = torch.stack([w, a, b, c, a, x, p, q, b, p, y, r, c, q, r, z], -1).unflatten(-1, (4, 4))
+    every = torch.stack([w, a, b, c, a, x, p, q, b, p, y, r, c, q, r, z], -1).reshape(*w.shape, 4, 4)
     best = four.argmax(-1)[..., None, None].expand(*four.shape[:-1], 1, 4)
     quaternion = torch.nn.functional.normalize(every.gather(-2, best)[..., 0, :], dim=-1)
     quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
@@ -76,17 +76,20 @@ class Wrist(Mechanism):
             home_joints=[0.0, 0.2, 0.0, 0.3, 1.4, -0.5],
         )
 
-    def forward_kinematics(self, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
         """Pose, `... x 6`, by the turns of the motors: the controller's own ratios of the shafts take them apart."""
         values = self.resolve(parameters)
-        links, lean = values[..., :24].unflatten(-1, (6, 4)), values[..., 24]
+        links, lean = values[..., :24].reshape(*values.shape[:-1], 6, 4), values[..., 24]
         q = list(joints.unbind(-1))
         q[4] = q[4] - values[..., 25] * q[3]
         q[5] = q[5] - values[..., 26] * q[3] - values[..., 27] * q[4]
         frame = torch.eye(4, dtype=joints.dtype)
         for k in range(6):
             a, d, alpha, theta = links[..., k, :].unbind(-1)
-            a, d, alpha, theta, angle = torch.broadcast_tensors(a, d, alpha, theta, q[k])
+            one = torch.ones_like(q[k])
+            a, d, alpha, theta, angle = a * one, d * one, alpha * one, theta * one, q[k] + 0 * a
             frame = frame @ about(2, angle + theta) @ along(a, d) @ about(0, alpha)
             if k == 1:
                 frame = frame @ about(1, lean.expand_as(angle))
