@@ -62,10 +62,6 @@ class Thermal(Effect):
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """The whole machine, its members, its sliding drives; then what is secondary."""
-        every = self._every(situation)
-        return tuple(every[k] for k in _kept(situation, every))
-
-    def _every(self, situation: Situation) -> list[Coefficient]:
         mechanism = situation.mechanism
         recorded = _recorded(situation)
         found = [Coefficient("growth", "1/K", _STEEL, positive=recorded)]
@@ -82,15 +78,20 @@ class Thermal(Effect):
         drives += [
             Coefficient(f"{j.name} mount", f"{j.unit}/K", _mount(j.unit, reach), joint=j.name, secondary=True)
             for j, reach in zip(mechanism.joints, (high - low).tolist(), strict=True)
+            # In time alone what moves one turning joint is its drift.
+            if recorded or j.unit == "m"
         ]
         found += drives
-        found.append(Coefficient("reference", "1", _STEEL * _REFERENCE_OFF, secondary=True))
-        if "time" in situation.covariates:
-            own = _STEEL * _OWN_WARMTH
-            found.append(Coefficient("at once", "1/K", uneven, secondary=True))
+        if recorded:
+            found.append(Coefficient("reference", "1", _STEEL * _REFERENCE_OFF, secondary=True))
+        if _timed(situation):
+            if recorded:
+                found.append(Coefficient("at once", "1/K", uneven, secondary=True))
             later = [*following, *(c for c in drives if c.joint in sliding)]
             names = ["late", *(f"{c.name} late" for c in later[1:])]
             found += [replace(c, name=n, secondary=True, positive=False) for c, n in zip(later, names, strict=True)]
+        if _timed(situation) and recorded:
+            own = _STEEL * _OWN_WARMTH
             found += [
                 Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
                 for j in mechanism.joints
@@ -113,11 +114,11 @@ class Thermal(Effect):
             for name in situation.thermometers
             for c in (*following, *bodies, *drives)
         ]
-        return found
+        return tuple(found)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """The lag, from none to the time of all rows; () without times."""
-        if "time" not in situation.covariates:
+        if not _timed(situation):
             return ()
         whole = max(float(elapsed(situation.covariates["time"]).max()), 1e-6)
         low, high = (math.log(share * whole) for share in _WARM_SHARES)
@@ -145,11 +146,16 @@ class Thermal(Effect):
         apart = [longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism)]
         travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
         following = [whole, *apart, travel]
-        timed = [whole, *following, jacobian[..., sliding], jacobian, *following] if _timed(situation) else []
+        mounts = jacobian[..., sliding]
+        if not _recorded(situation):
+            columns = [*following, mounts, *following, mounts]
+        elif _timed(situation):
+            columns = [*following, jacobian, whole, whole, *following, mounts, jacobian, *following]
+        else:
+            columns = [*following, jacobian, whole]
         bodies = [longer[..., p.lengths].sum(-1, keepdim=True) for p in like_parts(mechanism)]
         others = [whole, *apart, *bodies, travel, jacobian] * len(situation.thermometers)
-        every = torch.cat([*following, jacobian, whole, *timed, *bodies, *others], -1)
-        return every[..., _kept(situation, self._every(situation))]
+        return torch.cat([*columns, *bodies, *others], -1)
 
     def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
         """What each of the fixed columns is multiplied by: warmth [K], or what has become of it, `... x s x m`."""
@@ -159,20 +165,21 @@ class Thermal(Effect):
         n, sliding = len(mechanism.joints), sum(j.unit == "m" for j in mechanism.joints)
         following, one = 1 + len(_apart(mechanism)) + sliding, torch.ones_like(warm)
         bodies = len(like_parts(mechanism))
-        body, kinds = warm, [(one, 1)]
+        body, mounts, kinds = warm, n, [(one, 1)]
         if _timed(situation):
             time = situation.covariates["time"]
             body, core = (lagged(time, warm, shape[..., k]) for k in (0, 1))
             own = -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
             kinds += [(warm, 1), (core, following + sliding), (warm - body, n), (own, following)]
             others = [lagged(time, other, shape[..., 0]) for other in others]
-        kinds = [(body, following + n), *kinds, (body, bodies)]
+            if not _recorded(situation):
+                mounts, kinds = sliding, [(core, following + sliding)]
+        kinds = [(body, following + mounts), *kinds, (body, bodies)]
         for other in others:
             # A screw is as warm as its own thermometer; what a leg's shows is beside the growth of the whole machine.
             kinds += [(other - body, following - sliding + bodies), (other, sliding + n)]
         each = torch.stack(torch.broadcast_tensors(*(k for k, _ in kinds)), -1)  # type: ignore[no-untyped-call]
-        columns = [i for i, (_, count) in enumerate(kinds) for _ in range(count)]
-        return each[..., [columns[k] for k in _kept(situation, self._every(situation))]]
+        return each[..., [i for i, (_, count) in enumerate(kinds) for _ in range(count)]]
 
 
 def _mount(unit: str, reach: float) -> float:
@@ -182,14 +189,6 @@ def _mount(unit: str, reach: float) -> float:
 
 def _recorded(situation: Situation) -> bool:
     return any(map(is_temperature, situation.covariates))
-
-
-def _kept(situation: Situation, every: Sequence[Coefficient]) -> list[int]:
-    """Numbers of the coefficients that a temperature shows; in time alone what moves one joint is its drift."""
-    if _recorded(situation):
-        return [*range(len(every))]
-    others = ("reference", "at once", "bend", "warm-up")
-    return [k for k, c in enumerate(every) if not c.name.endswith(others) and c.unit != "rad/K"]
 
 
 def _warmth(situation: Situation) -> Tensor:

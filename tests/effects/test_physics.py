@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
+from physical_rows import ARM, acting, columns, situation
 from torch import Tensor
 
 from ccnn_torch.effects import (
-    Acting,
-    Effect,
     Situation,
     default_gravity,
     make_effect,
@@ -24,56 +22,12 @@ from ccnn_torch.effects import (
 )
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
 from ccnn_torch.effects.loads import members
-from ccnn_torch.effects.situation import REFERENCE
-from ccnn_torch.effects.time import lagged, velocity
+from ccnn_torch.effects.time import velocity
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
-ARM = str(Path(__file__).parent / "arm.yaml")
-
-
-def situation(name: str, rows: int = 9, seed: int = 0, **columns: Tensor) -> Situation:
-    mechanism = load_mechanism(name)
-    generator = torch.Generator().manual_seed(seed)
-    joints = mechanism.sample_joints(20 * rows, generator)
-    joints = joints[mechanism.condition_number(joints) < 30][:rows]
-    drawn = draw_covariates(mechanism, joints, generator)
-    return Situation(mechanism, joints, {**drawn, **columns}, default_gravity(mechanism))
-
-
-def acting(effect: str, rows: Situation, **values: float) -> Acting:
-    """An effect with these coefficients (blanks as underscores), all others 0; shapes by name too."""
-    made = make_effect(effect)
-    coefficients = [values.pop(c.name.replace(" ", "_"), 0.0) for c in made.coefficients(rows)]
-    shapes = [values.pop(s.name.replace(" ", "_"), s.grid[0]) for s in made.shapes(rows)]
-    assert not values
-    return Acting(made, torch.tensor(shapes, dtype=torch.float64), torch.tensor(coefficients, dtype=torch.float64))
-
-
-def columns(effect: Effect, rows: Situation, shape: Tensor) -> dict[str, Tensor]:
-    names = [c.name for c in effect.coefficients(rows)]
-    return dict(zip(names, signature(rows, effect, shape).unbind(-1), strict=True))
-
-
 GANTRY = Path(__file__).parent / "gantry.yaml"
 NO_SHAPE = torch.zeros(0, dtype=torch.float64)
-
-
-def test_a_body_follows_its_surroundings_as_the_differential_equation_says() -> None:
-    rng = np.random.default_rng(3)
-    time = np.sort(rng.uniform(0, 5000, 40))
-    value = rng.normal(size=40)
-    for lag in (30.0, 700.0, 1e5):
-
-        def rate(t: float, y: np.ndarray, lag: float = lag) -> np.ndarray:
-            return (np.interp(t, time, value) - y) / lag
-
-        found = solve_ivp(rate, time[[0, -1]], value[:1], t_eval=time, rtol=1e-9, atol=1e-12, max_step=5.0).y[0]
-        shuffled = rng.permutation(40)
-        got = lagged(torch.as_tensor(time[shuffled]), torch.as_tensor(value[shuffled]), torch.tensor(lag))
-        assert np.abs(got.numpy() - found[shuffled]).max() < 1e-6
-    now = lagged(torch.as_tensor(time), torch.as_tensor(value), torch.tensor(0.0, dtype=torch.float64))
-    assert np.abs(now.numpy() - value).max() < 1e-8
 
 
 def test_velocities_are_those_of_a_parabola_and_none_across_a_pause() -> None:
@@ -238,35 +192,6 @@ def test_what_a_load_holds_on_a_flank_does_not_depend_on_the_side_of_approach() 
     # The play is the way between the two sides of approach, which the soft edge leaves a little short of the flanks.
     flank = 1e-4 / math.tanh(1 / 0.3)
     assert torch.allclose(sides[0][pushed], flank * push[pushed].sign())
-
-
-@pytest.mark.parametrize("name", ["five_bar", "stewart"])
-def test_a_machine_that_grows_evenly_is_the_same_machine_larger(name: str) -> None:
-    warm = torch.linspace(-8, 9, 9, dtype=torch.float64)
-    rows = situation(name, temperature=REFERENCE + warm)
-    growth = 1.2e-5
-    travels = {f"{j.name}_travel": growth for j in rows.mechanism.joints if j.unit == "m"}
-    grown = reached(rows, [acting("thermal", rows, growth=growth, **travels)])
-    position = rows.platform[0]
-    assert torch.allclose(grown[:, :3], position * (1 + growth * warm[:, None]), atol=1e-12, rtol=0)
-    turned = reached(rows, [])[:, 3:]
-    assert torch.allclose(grown[:, 3:], turned, atol=1e-12, rtol=0)
-    # The members together are the whole.
-    effect = make_effect("thermal")
-    parts = columns(effect, rows, torch.tensor([500.0, 4000.0], dtype=torch.float64))
-    legs = [v for k, v in parts.items() if k.startswith("leg ") and not k.endswith(("warm-up", "late"))]
-    assert torch.allclose(sum(legs[1:], legs[0]), parts["growth"])
-
-
-def test_the_second_lag_is_of_what_is_late_and_of_no_plate() -> None:
-    rows = situation("stewart", temperature=torch.full((9,), REFERENCE, dtype=torch.float64))
-    rows = replace(rows, covariates=dict(rows.covariates) | {"temperature_plate": rows.covariates["temperature"]})
-    effect = make_effect("thermal")
-    names = [c.name for c in effect.coefficients(rows)]
-    first, second = (shape.columns for shape in effect.shapes(rows))
-    legs = [f"{joint.name} {what} late" for what in ("travel", "mount") for joint in rows.mechanism.joints]
-    assert [names[k] for k in second] == ["late", *(f"leg {k} late" for k in range(1, 7)), *legs]
-    assert sorted((*first, *second)) == [*range(len(names))] and names.index("growth plate") in first
 
 
 def test_play_is_the_way_between_both_sides_of_approach() -> None:
@@ -501,10 +426,3 @@ def test_a_table_that_wobbles_tilts_what_it_carries_across_its_axis(tmp_path: Pa
     for name, size in (("x sin", 0.479425538604), ("x cos 2", 0.540302305868)):
         assert torch.allclose(found[f"q1 {name}"][0, :2], size * turn[:, 0])
     assert torch.allclose(found["q1 rx sin"][0, 3:5], 0.479425538604 * turn[:, 0])
-
-
-def test_lengths_grow_with_each_further_thermometer_by_what_it_shows_beyond_the_first() -> None:
-    rows = situation("tripod")
-    hotter = replace(rows, covariates={**rows.covariates, "temperature_drives": rows.covariates["temperature"] + 5})
-    by = columns(make_effect("thermal"), hotter, torch.zeros(2, dtype=torch.float64))
-    assert torch.allclose(by["growth drives"], 5 * by["reference"])
