@@ -19,8 +19,8 @@ _NOTHING: frozenset[str] = frozenset()
 def _softening(machine: Machine, design: Design, rng: np.random.Generator) -> Plan:
     """Drives that soften with the temperature: a load moves a warm machine farther.
 
-    Compliance acts as well, and is right to name. That it changes with the temperature had no name when these cases
-    were written, and is `thermal_compliance` since. Either factor of the product is a driver.
+    Compliance acts as well, and is right to name; that it changes with the temperature has no name. Either factor of
+    the product is a driver.
     """
     servo = machine.stiff / rng.uniform(0.6, 1.4, machine.drives)
     loads = tuple(f"load_{c}" for c in machine.pose)
@@ -30,7 +30,6 @@ def _softening(machine: Machine, design: Design, rng: np.random.Generator) -> Pl
         (frozenset({"compliance"}), _NOTHING),
         True,
         (*loads, "temperature"),
-        enough=(frozenset({"compliance", "thermal_compliance"}),),
     )
     return Plan(
         lambda strength: Build(servo=servo / strength),
