@@ -46,7 +46,7 @@ from ccnn_validation.hollow_wrist_robot import (
     D,
     G,
     Robot,
-    frames,
+    sheet_frames,
 )  # fmt: skip
 from ccnn_validation.hollow_wrist_script import Told, by_process, corrected, fit, prefit
 
@@ -97,7 +97,7 @@ def day(rows: int, rng: np.random.Generator, share: float = 1.0) -> Array:
     """Joints all over the workspace, axis 5 bent by 15 degrees at least."""
     middle, half = (HIGH + LOW) / 2, (HIGH - LOW) / 2 * share
     joints = rng.uniform(middle - half, middle + half, (20 * rows, 6))
-    low = frames(joints, A, np.radians(ALPHA), D, np.radians(THETA))[:, 5:, 2, 3].min(1)
+    low = sheet_frames(joints)[:, 5:, 2, 3].min(1)
     return np.asarray(joints[(np.abs(joints[:, 4]) > np.radians(15)) & (low > 0.2)][:rows])
 
 
@@ -113,7 +113,7 @@ def ways(joints: Array) -> Array:
 
 def missed(wanted: Array, reached: Array) -> list[float]:
     """RMS and largest miss [m] in the best frame, with the best point on the data sheet's flange."""
-    last = frames(wanted, A, np.radians(ALPHA), D, np.radians(THETA))[:, 6]
+    last = sheet_frames(wanted)[:, 6]
 
     def off(x: Array) -> Array:
         at = (last[:, :3, :3] @ (POINTS[2] + 1e-3 * x[:3])) + last[:, :3, 3]
@@ -140,7 +140,7 @@ def table(
     parts = [np.degrees(shown), way, (20 + warmth)[:, None]]
     mass = np.array([TOOLS[int(k)][0] for k in kind])
     if loads:
-        last = frames(joints, A, np.radians(ALPHA), D, np.radians(THETA))[:, 6]
+        last = sheet_frames(joints)[:, 6]
         # By the data sheet: from the reflector to the tool's centre of mass.
         arm = np.array([TOOLS[int(k)][1] for k in kind]) - POINTS[kind]
         arm = (turn @ (last[:, :3, :3] @ arm[..., None]))[..., 0]

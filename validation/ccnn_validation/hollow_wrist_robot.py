@@ -44,6 +44,11 @@ def frames(joints: Array, a: Array, alpha: Array, d: Array, theta: Array, lean: 
     return found
 
 
+def sheet_frames(joints: Array) -> Array:
+    """Frames by the data sheet, `s x 7 x 4 x 4`."""
+    return frames(joints, A, np.radians(ALPHA), D, np.radians(THETA))
+
+
 def torques(chain: Array, masses: Array, centres: Array, tool: Array, centre: Array, down: Array) -> Array:
     """What weight turns each joint with [Nm], `s x 6`; `tool`: its mass in each row, and its centre `s x 3`."""
     places = chain[:, 1:, :3, 3] + (chain[:, 1:, :3, :3] @ centres[..., None])[..., 0]

@@ -22,6 +22,7 @@ from ccnn_validation.hollow_wrist_robot import (
     A,
     D,
     frames,
+    sheet_frames,
     torques,
 )  # fmt: skip
 
@@ -49,7 +50,7 @@ def split(x: Array) -> dict[str, Array]:
 
 def prefit(joints: Array, kind: Array, seen: Array) -> Array:
     """Rows in the robot's base by the data sheet alone, best frame and points, `s x 3` [m]."""
-    last = frames(joints, A, np.radians(ALPHA), D, np.radians(THETA))[:, 6]
+    last = sheet_frames(joints)[:, 6]
     at = (last[:, :3, :3] @ POINTS[kind][..., None])[..., 0] + last[:, :3, 3]
     turn, _ = Rotation.align_vectors(seen - seen.mean(0), at - at.mean(0))
     return np.asarray(turn.inv().apply(seen - seen.mean(0)) + at.mean(0))
@@ -66,7 +67,7 @@ def flange(x: Array, joints: Array, told: Told) -> Array:
     links = (A + n["a"]) * grown, np.radians(ALPHA) + n["alpha"], (D + n["d"]) * grown, np.radians(THETA) + n["theta"]
     mass = np.array([TOOLS[int(k)][0] for k in kind])
     centre = np.array([TOOLS[int(k)][1] for k in kind], dtype=float)
-    tau = torques(frames(joints, A, np.radians(ALPHA), D, np.radians(THETA)), MASSES, CENTRES, mass, centre, DOWN)
+    tau = torques(sheet_frames(joints), MASSES, CENTRES, mass, centre, DOWN)
     load, waves = tau.copy(), n["gears"].reshape(4, 6)
     load[:, 3:] = tau[:, 3:] @ inverse
     turned = motors + SOFT * (1 + n["soft"]) * load
@@ -100,7 +101,7 @@ def seen_by(x: Array, joints: Array, told: Told, turn: Rotation) -> Array:
 
 def fit(joints: Array, told: Told, seen: Array, full: bool) -> tuple[Array, Array]:
     """Numbers of the script, and what it leaves in the robot's base, `s x 3` [m]."""
-    last = frames(joints, A, np.radians(ALPHA), D, np.radians(THETA))[:, 6]
+    last = sheet_frames(joints)[:, 6]
     at = (last[:, :3, :3] @ POINTS[told[0]][..., None])[..., 0] + last[:, :3, 3]
     turn, _ = Rotation.align_vectors(seen - seen.mean(0), at - at.mean(0))
     size = np.concatenate([np.full(k, s if full or name not in FULL else 0.0) for name, (k, s) in GROUPS.items()])
@@ -124,7 +125,7 @@ def fit(joints: Array, told: Told, seen: Array, full: bool) -> tuple[Array, Arra
 
 def corrected(wanted: Array, told: Told, x: Array, more: Array | float = 0.0) -> Array:
     """Commands at which the script's flange is where the data sheet's is, damped; `more`: what else moves it [m]."""
-    goal = frames(wanted, A, np.radians(ALPHA), D, np.radians(THETA))[:, 6]
+    goal = sheet_frames(wanted)[:, 6]
     sent, step, size = wanted.copy(), 1e-6, np.r_[np.ones(3), np.full(3, 0.2)]
 
     def off(joints: Array) -> Array:
