@@ -114,7 +114,9 @@ def save_figure(figure: Figure, path: str | Path, pixels: bool = True) -> Path:
     canvas = FigureCanvasAgg(figure)
     layout = figure.get_layout_engine()
     if layout is not None:
-        layout.execute(figure)
+        # Twice: panels of one scale take their shape from the first, and texts above and below them move with it.
+        for _ in range(2):
+            layout.execute(figure)
         figure.set_layout_engine("none")
     # Written by the canvases themselves: `savefig` draws everything once more beforehand, to find the layout.
     if pixels:

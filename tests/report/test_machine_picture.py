@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.quiver import Quiver
 
+from ccnn_torch.report.figures import save_figure
 from ccnn_torch.report.machine import machine_plot
 
 
@@ -60,6 +62,26 @@ def test_a_long_title_stays_within_the_picture() -> None:
     FigureCanvasAgg(plot.figure).draw()
     title = plot.figure.axes[-1]._left_title.get_window_extent()  # type: ignore[attr-defined]
     assert title.x1 < plot.figure.bbox.x1
+
+
+def test_titles_and_axes_of_a_saved_picture_are_within_it(tmp_path: Path) -> None:
+    arrays = {name: value.numpy() for name, value in one_effect()[1].items()}
+    # Low places in a picture of two panels.
+    arrays["drawn.place"] = np.array([2.3, 1.1, -0.3]) + np.array([0.55, 0.45, 0.1]) * _unit(arrays["drawn.place"])
+    plot = machine_plot(arrays, "With thermal growth in it")
+    assert plot is not None
+    save_figure(plot.figure, tmp_path / "machine", pixels=False)
+    FigureCanvasAgg(plot.figure).draw()
+    for axes in plot.figure.axes:
+        title = axes._left_title.get_window_extent()  # type: ignore[attr-defined]
+        below = axes.xaxis.label.get_window_extent()
+        assert title.y1 < plot.figure.bbox.y1 and below.y0 > plot.figure.bbox.y0
+
+
+def _unit(place: np.ndarray) -> np.ndarray:
+    """Places within half a unit of nought."""
+    low, high = np.nanmin(place, 0), np.nanmax(place, 0)
+    return np.asarray((place - low) / np.maximum(high - low, 1e-12) - 0.5)
 
 
 def test_errors_without_a_direction_are_circles_as_wide_as_they_are_large() -> None:
