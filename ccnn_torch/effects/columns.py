@@ -43,13 +43,14 @@ def of_rows(values: Tensor, rows: Tensor | None, dim: int = -2) -> Tensor:
 
 
 class OfJoints(Effect):
-    """An effect each of whose coefficients moves one joint: those of the first joint come first."""
+    """An effect each of whose coefficients moves one joint, by its motor: those of the first joint come first."""
 
     kind = "joints"
 
     @abstractmethod
     def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
-        """Change of each joint per unit of its own coefficients, `... x t x n x m`; rows: which, `t`; None = all."""
+        """Change of each joint's motor per unit of its own coefficients, `... x t x n x m`; rows: which, `t`; None =
+        all."""
 
     def moving(self, situation: Situation) -> list[int]:
         """Numbers, from 0, of the joints that have coefficients."""
@@ -57,10 +58,14 @@ class OfJoints(Effect):
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x (joints that have coefficients · m)`."""
+        return situation.joints_by(self.of_motors(situation, shape))
+
+    def of_motors(self, situation: Situation, shape: Tensor) -> Tensor:
+        """The same of the motors, where joints have motors in common; each column moves one of them."""
         return by_joint(self.moves(situation, shape), self.moving(situation))
 
     def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
-        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
+        """The same in some of the rows, without its zeros: what each coefficient does to the motor that it moves.
 
         rows: which, `t`; None = all. Returns `... x t x (joints that have coefficients · m)`.
         """

@@ -181,7 +181,7 @@ class Transmission(OfJoints):
 
     def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
         """Waves of each joint."""
-        angle = of_rows(situation.joints, rows) * shape.unsqueeze(-2)
+        angle = of_rows(situation.motor_turns, rows) * shape.unsqueeze(-2)
         sine, cosine = torch.sin(angle), torch.cos(angle)
         waves = [sine, cosine]
         # The next harmonic by the sum of angles: sines are what a grid of hundreds of frequencies takes its time for.

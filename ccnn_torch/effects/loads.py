@@ -132,7 +132,7 @@ class Compliance(Effect):
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
-        jacobian, torque = torch.nan_to_num(situation.jacobian), situation.carried_torque
+        jacobian, torque = torch.nan_to_num(situation.motor_jacobian), situation.carried_torque
         typical = torch.tensor([_TYPICAL[j.unit] for j in situation.mechanism.joints], dtype=torch.float64)
         ratio = torque.abs() / typical
         parts = [jacobian * (torque * ratio**k).unsqueeze(-2) for k in range(3)]
@@ -175,7 +175,7 @@ class ThermalCompliance(Effect):
         """`... x s x n x m`."""
         torques = [situation.load_torque] if situation.loaded else []
         warm = situation.temperature[..., None, None] - REFERENCE
-        return by_joint(torch.stack([*torques, situation.own_weight_torque], -1) * warm)
+        return situation.joints_by(by_joint(torch.stack([*torques, situation.own_weight_torque], -1) * warm))
 
 
 class Sag(Effect):
@@ -208,7 +208,7 @@ class Sag(Effect):
         """`... x s x n x m`."""
         joints, zero = situation.mechanism.joints, torch.zeros_like(situation.joints[..., 0])
         torques = [situation.covariates.get(torque_of(j), zero).expand_as(zero) for j in joints]
-        return by_joint(torch.stack(torques, -1).unsqueeze(-1), self._measured(situation))
+        return situation.joints_by(by_joint(torch.stack(torques, -1).unsqueeze(-1), self._measured(situation)))
 
 
 def _stretching(situation: Situation) -> Tensor:
@@ -318,7 +318,7 @@ class Gravity(Effect):
             parts += [situation.weight_torque, situation.inner_weight_torque]
         else:
             parts += [torch.cos(joints), torch.sin(joints)]
-        columns = by_joint(torch.stack(parts, -1))
+        columns = situation.joints_by(by_joint(torch.stack(parts, -1)))
         if not arm:
             kept = [4 * i + k for i, turns in enumerate(turning) for k in (range(4) if turns else range(2))]
             columns = columns[..., kept]

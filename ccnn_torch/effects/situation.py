@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -265,6 +266,33 @@ class Situation:
         """Commanded joints less the middle of their workspace, `... x s x n` [joint's unit]."""
         return self.joints - self.middle
 
+    @cached_property
+    def _motors(self) -> tuple[Tensor, Tensor] | None:
+        """Turns of the motors by those of the joints, `n x n`, and its inverse; None where each joint has its own."""
+        if not self.mechanism.motors:
+            return None
+        # By numpy: a graph that is traced has no inverse of a constant.
+        turns = np.array(self.mechanism.motors)
+        return torch.tensor(turns, dtype=self.joints.dtype), torch.tensor(np.linalg.inv(turns), dtype=self.joints.dtype)
+
+    @cached_property
+    def motor_turns(self) -> Tensor:
+        """How far the motor of each joint has turned, over its gear, at the commanded joints, `... x s x n`."""
+        return self.joints if self._motors is None else self.joints @ self._motors[0].mT
+
+    @cached_property
+    def motor_jacobian(self) -> Tensor:
+        """Derivative of position and rotation vector by the motors' turns, `... x s x c x n`; NaN without pose."""
+        return self.jacobian if self._motors is None else self.jacobian @ self._motors[1]
+
+    def joints_by(self, motors: Tensor) -> Tensor:
+        """What changes of the motors `... x n x m` change of the joints, `... x n x m`."""
+        return motors if self._motors is None else self._motors[1] @ motors
+
+    def _on_motors(self, torque: Tensor) -> Tensor:
+        """What torques on the joints `... x n` are on the motors, over their gears, by virtual work, `... x n`."""
+        return torque if self._motors is None else torque @ self._motors[1]
+
     def once(self, make: Callable[[Situation], Tensor]) -> Tensor:
         """What a function makes of these rows, kept with them from when it is first asked for."""
         kept: dict[Callable[[Situation], Tensor], Tensor] = self.__dict__.setdefault("_kept", {})
@@ -322,14 +350,15 @@ class Situation:
         slope, wrench = _known(self.jacobian), self.wrench
         torque: Tensor = (slope.mT @ wrench[..., : slope.shape[-2]].unsqueeze(-1)).squeeze(-1)
         if wrench.shape[-1] == slope.shape[-2]:
-            return torque
+            return self._on_motors(torque)
         # Of an arm whose position alone is measured: moments turn its joints about their axes.
         arm = self.mechanism
         assert isinstance(arm, SerialArm)
         values = arm.resolve(self.parameters)
         turned = (arm_axes(arm, self.joints, values)[1] @ wrench[..., 3:].unsqueeze(-1)).squeeze(-1) * arm.revolute
         coupled = arm.coupled(self.joints, values)
-        return torque + (turned if coupled is None else (coupled.mT @ turned.unsqueeze(-1)).squeeze(-1))
+        turned = turned if coupled is None else (coupled.mT @ turned.unsqueeze(-1)).squeeze(-1)
+        return self._on_motors(torque + turned)
 
     @cached_property
     def weight_torque(self) -> Tensor:
@@ -338,7 +367,7 @@ class Situation:
             return self.whole.weight_torque
         # As a matrix product: the ONNX exporter gets that of a stack of matrices with one vector wrong.
         torque: Tensor = _known(self.jacobian)[..., :3, :].mT @ self.down.unsqueeze(-1)
-        return torque.squeeze(-1)
+        return self._on_motors(torque.squeeze(-1))
 
     @cached_property
     def own_weight_torque(self) -> Tensor:
@@ -390,7 +419,7 @@ class Situation:
         rates = torch.where(arm.revolute[:, None], turned, slid) * arm.signs[:, None]
         torque: Tensor = (rates @ self.down.unsqueeze(-1)).squeeze(-1)
         coupled = arm.coupled(self.joints, values)
-        return torque if coupled is None else (coupled.mT @ torque.unsqueeze(-1)).squeeze(-1)
+        return self._on_motors(torque if coupled is None else (coupled.mT @ torque.unsqueeze(-1)).squeeze(-1))
 
     @cached_property
     def down(self) -> Tensor:

@@ -17,7 +17,7 @@ from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text, read_xml
 from ccnn_torch.files.yaml_file import parse_yaml
-from ccnn_torch.mechanisms.gears import read_gears
+from ccnn_torch.mechanisms.gears import read_gears, read_motors
 from ccnn_torch.mechanisms.machines.links import compose
 from ccnn_torch.mechanisms.machines.serial import MOST_JOINTS, SerialArm
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
@@ -41,8 +41,9 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     [x, y, z]; replaces the tool frame for records without orientation), `goal_tool` (the frame that commanded poses are
     of, where it is not the measured one), `frame_per`, `tool_per`, `robot` (its name), `limits` of the joints
     (each [lowest, highest] in the file's units; a full turn or a metre), `masses` of the links [kg],
-    `centres` of these (each [x, y, z] in the frame at the link's end; [] or missing: halfway to the next axis), and
-    `gears` (of each joint turns of the motor for one of the joint, the lead of a screw in the file's length, or null).
+    `centres` of these (each [x, y, z] in the frame at the link's end; [] or missing: halfway to the next axis),
+    `gears` (of each joint turns of the motor for one of the joint, the lead of a screw in the file's length, or null),
+    and `motors` (of those that turn with other joints as well, as `{q5: {q4: 0.667}}`, see `read_motors`).
 
     Args:
         path: the file.
@@ -93,6 +94,7 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
         masses=table.masses(n),
         centres=table.centres(n, length),
         gears=table.gears(types, length),
+        motors=table.motors(types),
         leans=[[i, v * angle] for i, v in enumerate(table.numbers("beta", n, default=[0.0] * n), 1) if v],
     )
 
@@ -150,11 +152,20 @@ class _Table:
         """As of `read_gears`; none where the file does not tell them."""
         if "gears" not in self.content:
             return []
-        joints = [Coordinate(f"q{i}", "m" if kind == "prismatic" else "rad") for i, kind in enumerate(types, 1)]
         where = f"{self.path}: key 'gears'"
         return read_gears(
-            self.content["gears"], joints, where, lambda v, unit: _number(v, where) * (length if unit == "m" else 1.0)
+            self.content["gears"],
+            _joints(types),
+            where,
+            lambda v, unit: _number(v, where) * (length if unit == "m" else 1.0),
         )
+
+    def motors(self, types: Sequence[str]) -> Mapping[str, Mapping[str, float]] | None:
+        """As the file has them, checked; None where it does not tell them."""
+        told = self.content.get("motors")
+        if told is not None:
+            read_motors(told, _joints(types), f"{self.path}: key 'motors'")
+        return told
 
     def masses(self, count: int) -> list[float]:
         """[kg]; none where the file does not tell them."""
@@ -209,6 +220,10 @@ class _Table:
             raise InputError(f"{self.path}: key '{key}' must be 'unknown', 'identity' or {form}, got {value!r}")
         where = f"{self.path}: key '{key}'"
         return [_number(v, f"{where}, entry {i + 1}") * s for i, (v, s) in enumerate(zip(value, scales, strict=True))]
+
+
+def _joints(types: Sequence[str]) -> list[Coordinate]:
+    return [Coordinate(f"q{i}", "m" if kind == "prismatic" else "rad") for i, kind in enumerate(types, 1)]
 
 
 def _number(value: Any, where: str) -> float:

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
+from ccnn_torch.spelling import hint
+
+Motors = tuple[tuple[float, ...], ...]
+"""How far each motor turns, over its own gear, for one unit of each joint: a row each motor."""
+# More turns a turn than any gear between two joints makes.
+_MOST = 1e3
+# A larger condition number leaves no digits of what a controller shows.
+_CONDITION = 1e4
+# Rounding of an inverse.
+_NONE = 1e-9
 
 
 def read_gears(
@@ -32,3 +44,45 @@ def read_gears(
     if any(v is not None and v <= 0 for v in found):
         raise InputError(f"{where} must be above 0, or null where nothing is known, not {told}")
     return found
+
+
+def read_motors(told: Any, joints: Sequence[Coordinate], where: str) -> Motors:
+    """Of motors that turn with other joints as well, as those of a wrist whose shafts run within each other.
+
+    Args:
+        told: ``{q5: {q4: 0.667}}``: the motor of q5 turns q5 + 0.667 q4, over its gear; 1 of its own joint unless told.
+        joints: those of the machine.
+        where: opens the sentence of an error.
+
+    Raises:
+        InputError: no such tree, joints of other units, or motors from which the joints do not follow.
+    """
+    form, names = f"{where} must be as {{q5: {{q4: 0.667}}}}", [joint.name for joint in joints]
+    if not isinstance(told, Mapping) or not all(isinstance(row, Mapping) for row in told.values()):
+        raise InputError(f"{form}: of a motor, by its joint, what other joints turn it, got {told!r}")
+    found = np.eye(len(joints))
+    for motor, row in told.items():
+        for name in (motor, *row):
+            if name not in names:
+                raise InputError(f"{where}: '{name}' is no joint of the machine; {hint(str(name), names, 'they are')}")
+        to = names.index(motor)
+        for name, value in row.items():
+            by = names.index(name)
+            if joints[by].unit != joints[to].unit:
+                raise InputError(f"{where}: {name} is in {joints[by].unit}, and {motor} in {joints[to].unit}")
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _MOST:
+                raise InputError(f"{where}: {motor}: {name}: must be a number of turns a turn, got {value!r}")
+            found[to, by] = value
+    if np.linalg.cond(found) > _CONDITION:
+        raise InputError(f"{where}: the joints do not follow from these motors; give every motor its own joint")
+    return tuple(map(tuple, found.tolist()))
+
+
+def moved_by(motors: Motors) -> list[tuple[int, int]]:
+    """Pairs of joints, from 1: the first one moves with the second one where a ratio between motors is a little off."""
+    if not motors:
+        return []
+    turns = np.array(motors)
+    others = (turns != 0) & ~np.eye(len(turns), dtype=bool)
+    moved = np.abs(np.linalg.inv(turns)) @ others > _NONE
+    return [(int(i) + 1, int(j) + 1) for i, j in np.argwhere(moved) if i != j]

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import branches as _branches, newton as _numeric
+from ccnn_torch.mechanisms.gears import Motors
 from ccnn_torch.mechanisms.pose import (
     CHANNELS,
     PoseError,
@@ -75,6 +76,9 @@ class Mechanism(nn.Module):
         frame_per, tool_per: columns of records that number groups of rows with a base or tool frame of their own.
         gears: of each joint what its drive's file tells: turns of the motor for a turn of the joint [1], or the lead of
             a screw [m], or None; () where nothing is told.
+        motors: how far each motor turns, over its gear, for one unit of each joint, `n x n`; () where each joint has a
+            motor of its own. What acts in the drives (gears, backlash, springs) is then of the motors, by the names of
+            their joints.
     """
 
     nominal: Tensor
@@ -87,6 +91,7 @@ class Mechanism(nn.Module):
     frame_per: tuple[str, ...] = ()
     tool_per: tuple[str, ...] = ()
     gears: tuple[float | None, ...] = ()
+    motors: Motors = ()
     closed_form: Literal["forward", "inverse"] | None = None
 
     def __init__(

@@ -128,6 +128,7 @@ def mechanism_text(
 
 _STANDARD = "standard Denavit-Hartenberg; link i = Rz(q_i + theta_i) * Tz(d_i) * Tx(a_i) * Rx(alpha_i)"
 _MODIFIED = "Rx(alpha_i) * Tx(a_i) * Rz(q_i + theta_i) * Tz(d_i)"
+_OF_THE_SHEET = ("limits", "masses", "centres", "gears", "motors")
 # As they stand in the file, without and with leans.
 _CONVENTIONS = {
     "standard": (_STANDARD, f"{_STANDARD} * Ry(beta_i)"),
@@ -154,7 +155,7 @@ def dh_text(arm: SerialArm) -> str:
         **dict(zip(("a", "alpha", "d", "theta"), links, strict=True)),
         **({"beta": arm.lean_of_links(arm.nominal).tolist()} if arm.leans else {}),
         "parallel_axes": [list(group) for group in arm.parallel_axes],
-        **{key: value for key in ("limits", "masses", "centres", "gears") if (value := arm.recipe["keys"].get(key))},
+        **{key: value for key in _OF_THE_SHEET if (value := arm.recipe["keys"].get(key))},
         "base_frame": "unknown" if arm.frame_per else values[:6],
         "tool_frame": "unknown" if arm.tool_per else values[-6:],
         "frame_per": list(arm.frame_per),

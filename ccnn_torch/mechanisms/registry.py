@@ -15,7 +15,7 @@ from ccnn_torch.mechanisms.dh_file import read_dh_file, read_urdf
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.frames.instrument import Instrument, instrument
 from ccnn_torch.mechanisms.frames.partial import Partial, Seen
-from ccnn_torch.mechanisms.gears import read_gears
+from ccnn_torch.mechanisms.gears import read_gears, read_motors
 from ccnn_torch.mechanisms.kinds.machine_file import build_machine, read_machine_file, template
 from ccnn_torch.mechanisms.machines.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.machines.five_bar import FiveBar
@@ -272,7 +272,7 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
             framed: mechanism, its keys, base, tool, frame_per, tool_per; partial: mechanism, its keys, pose;
             instrument: mechanism, its keys, kind, link, and those of the kind, or instruments; …); of any machine
-            `gears`, see `Mechanism`.
+            `gears` and `motors`, see `read_gears`, `read_motors`.
 
     Raises:
         InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, a
@@ -295,8 +295,9 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
 
         return load_machine(spec, allow_code=allow_code)
     maker = _maker(spec)
-    apart = spec not in _EXAMPLES and "gears" not in inspect.signature(maker).parameters
-    gears = keys.pop("gears", None) if apart else None
+    taken = inspect.signature(maker).parameters
+    of_drives = [key for key in ("gears", "motors") if spec not in _EXAMPLES and key not in taken]
+    apart = {key: keys.pop(key) for key in of_drives if key in keys}
     if is_plugin(spec):
         mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
     else:
@@ -304,10 +305,14 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
     plain = spec != "machine" and (spec in REGISTRY or is_plugin(spec))
     if plain and not isinstance(mechanism, Framed | Seen | Pair):
         mechanism.recipe = {"spec": spec, "keys": keys}
-    if gears is not None:
+    if "gears" in apart:
         where = f"mechanism '{spec}': gears"
-        told = read_gears(gears, mechanism.joints, where, lambda v, unit: amount(str(v), unit, where))
-        mechanism.gears, mechanism.recipe["keys"]["gears"] = tuple(told), told
+        told = read_gears(apart["gears"], mechanism.joints, where, lambda v, unit: amount(str(v), unit, where))
+        mechanism.gears, apart["gears"] = tuple(told), told
+    if "motors" in apart:
+        mechanism.motors = read_motors(apart["motors"], mechanism.joints, f"mechanism '{spec}': motors")
+    if apart:
+        mechanism.recipe["keys"].update(apart)
     return mechanism
 
 

@@ -58,6 +58,8 @@ class _OneByOne(Protocol):
 
     def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor: ...
 
+    def of_motors(self, situation: Situation, shape: Tensor) -> Tensor: ...
+
 
 @runtime_checkable
 class _Factored(Protocol):
@@ -130,11 +132,12 @@ class Scan:
         self.size = scales(coefficients, situation.joints)
         self.parts = _parts(self.shapes, len(coefficients))
         self.start = default_shape(situation, effect)
-        kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
+        moved = {"joints": "jacobian", "parameters": "parameter_jacobian"}.get(effect.kind)
+        moved = "motor_jacobian" if isinstance(effect, _OneByOne) else moved
         # What acts in two places of a row is no product of a derivative and a form.
         self.there = there if len(there.places) > 1 else None
-        kind = kind if self.there is None else None
-        self.lead = white(torch.nan_to_num(kind())) if kind is not None else None
+        moved = moved if self.there is None else None
+        self.lead = white(torch.nan_to_num(getattr(there, moved))) if moved is not None else None
         self.fixed: Tensor | None = None
         if isinstance(effect, _Factored) and self.there is None:
             self.fixed = white(torch.nan_to_num(situation.once(effect.fixed_columns))) * self.size
@@ -169,6 +172,8 @@ class Scan:
     def _basis(self, shapes: Tensor) -> Tensor:
         """What each coefficient changes, or in rows of two places the pose by it; shapes `g x h`, `g x s x ... x m`."""
         if self.there is None:
+            if isinstance(self.effect, _OneByOne):
+                return self.effect.of_motors(self.situation, shapes)
             return self.effect.basis(self.situation, shapes)
         return torch.nan_to_num(signature(self.situation, self.effect, shapes, self.there))
 

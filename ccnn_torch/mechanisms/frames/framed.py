@@ -97,7 +97,7 @@ class Framed(Around):
             home_pose=_coordinates(*start).tolist(),
             home_joints=inner.home_joints.tolist(),
         )
-        self.mechanism, self.takes, self.gears = inner, inner.takes, inner.gears
+        self.mechanism, self.takes, self.gears, self.motors = inner, inner.takes, inner.gears, inner.motors
         self.base, self.tool, self.rotation_weight = base, tool, rotation_weight
         self.frame_per, self.tool_per = tuple(frame_per), tuple(tool_per)
         # Where the coordinates of the mechanism's pose are those of its frame there is nothing to search.

@@ -72,7 +72,7 @@ class Seen(Around, ABC):
             home_pose=home,
             home_joints=inner.home_joints.tolist(),
         )
-        self.mechanism, self.takes, self.gears = inner, inner.takes, inner.gears
+        self.mechanism, self.takes, self.gears, self.motors = inner, inner.takes, inner.gears, inner.motors
 
     def inner_values(self, parameters: Tensor | None) -> Tensor | None:
         """Of the parameters `... x k` those of the mechanism inside; None where none are given."""

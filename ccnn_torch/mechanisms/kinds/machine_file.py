@@ -25,7 +25,7 @@ from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.files.yaml_file import parse_yaml
-from ccnn_torch.mechanisms.gears import read_gears
+from ccnn_torch.mechanisms.gears import read_gears, read_motors
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.spelling import hint
@@ -40,7 +40,7 @@ _TOLERANCE = re.compile(r"\+-|±")
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 _OF_ARMS = (
     *("base_frame", "tool_frame", "tool_offset", "orientation", "frame_per", "tool_per"),
-    *("limits", "gears", "pitch_errors"),
+    *("limits", "gears", "motors", "pitch_errors"),
 )
 _FRAME = ("m", "m", "m", "rad", "rad", "rad")
 
@@ -125,6 +125,9 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         point = [*offset, 0, 0, 0] if isinstance(offset, list) else offset
         frames["tool"] = _frame(point, f"{where}: tool_offset")
     joints = [f"q{i + 1}" for i in range(len(moves))]
+    known = [Coordinate(joint, "rad" if how == "turn" else "m") for joint, (how, _) in zip(joints, moves, strict=True)]
+    if motors := content.get("motors"):
+        read_motors(motors, known, f"{where}: motors")
     limits = {**about["limits"], **_by_joint(content, "limits", "{q1: [0 mm, 500 mm]}", joints, where)}
     return SerialArm(
         name=name,
@@ -145,7 +148,8 @@ def _arm(content: Mapping[str, Any], given: Mapping[str, Any], where: str, _: An
         drives=[(int(d[5]), int(d[6])) for e in about["numbers"].values() for d in e["of"] if d.startswith("drive")],
         numbers=numbers,
         tables=_tables(content, joints, moves, where),
-        gears=_gears(content, joints, moves, where),
+        gears=_gears(content, known, where),
+        motors=motors,
     )
 
 
@@ -158,19 +162,16 @@ def _by_joint(content: Mapping[str, Any], key: str, form: str, joints: Sequence[
     return given
 
 
-def _gears(
-    content: Mapping[str, Any], joints: Sequence[str], moves: Sequence[Sequence[str]], where: str
-) -> list[float | None]:
+def _gears(content: Mapping[str, Any], joints: Sequence[Coordinate], where: str) -> list[float | None]:
     """As of `read_gears`; none where none is told."""
-    given = _by_joint(content, "gears", "{q1: 80, q3: 20 mm}", joints, where)
-    known = [Coordinate(joint, "rad" if how == "turn" else "m") for joint, (how, _) in zip(joints, moves, strict=True)]
+    given = _by_joint(content, "gears", "{q1: 80, q3: 20 mm}", [joint.name for joint in joints], where)
 
     def number(text: Any, unit: str) -> float:
         if unit == "m" and _BARE.fullmatch(str(text)):
             raise InputError(f"{where}: gears: '{text}' has no unit; write {text} mm")
         return _amount(text, unit, f"{where}: gears")
 
-    return read_gears([given.get(joint) for joint in joints], known, f"{where}: gears", number) if given else []
+    return read_gears([given.get(joint.name) for joint in joints], joints, f"{where}: gears", number) if given else []
 
 
 def _tables(

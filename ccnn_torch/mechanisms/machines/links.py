@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,13 +12,19 @@ from torch import Tensor
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.numerics.batching import stack_last
-from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import (
+    euler_zyx_to_matrix,
+    matrix_to_euler_zyx,
+    matrix_to_rotation_vector,
+    rotation_vector_to_matrix,
+)
 
 # Sine of the angle between axes below which they count as parallel: Denavit-Hartenberg parameters of axes at a degree
 # are as good as undetermined.
 _PARALLEL = 0.02
 # Plausible share by which a drive moves another joint, or its own too far: that of a gear or a scale.
 _DRIVE = 1e-3
+Transform = tuple[Tensor, Tensor]
 LinkTransform = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
@@ -205,3 +211,33 @@ def weighing(arm: str, masses: Sequence[float], centres: Sequence[Sequence[float
     told = [list(centre) or [math.nan] * 3 for centre in centres or [()] * count]
     named = {"masses": masses, "_centres": told}
     return {key: torch.tensor(values, dtype=torch.float64) for key, values in named.items()}
+
+
+class LinkFrames(NamedTuple):
+    """Links with six parameters each, in the URDF form: `links` `n x 6` [m, rad]; `centres` of mass of these, [] where
+    unknown; `last`, the constant part of the last one, which is behind its joint."""
+
+    links: list[list[float]]
+    centres: list[list[float]]
+    last: Transform
+
+    def from_last(self, frame: Tensor) -> list[float]:
+        """A tool frame of the table, `6` [m, rad], as one behind the last joint."""
+        turn, place = compose(self.last, transform_of(frame))
+        return [*place.tolist(), *matrix_to_rotation_vector(turn).tolist()]
+
+
+def link_frames_of(transforms: Transform, centres: Tensor, axis_before: bool) -> LinkFrames:
+    """Of a table's links in their zero: rotations `n x 3 x 3` and places `n x 3` [m] from each to the one before.
+
+    centres: of mass, each in the frame at its link's end, `n x 3` [m]; axis_before: whether a joint moves before its
+    link's transform.
+    """
+    rotations, places = transforms
+    links = torch.cat([places, matrix_to_euler_zyx(rotations).flip(-1)], dim=-1)
+    last = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    if axis_before:
+        centres = (rotations @ centres.unsqueeze(-1)).squeeze(-1) + places
+        links = torch.cat([torch.zeros_like(links[:1]), links[:-1]])
+        last = rotations[-1], places[-1]
+    return LinkFrames(links.tolist(), [[] if math.isnan(one[0]) else one for one in centres.tolist()], last)

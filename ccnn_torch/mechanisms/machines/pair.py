@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,6 +64,12 @@ class Pair(Mechanism):
         self.first, self.second = first, second
         told = [arm.gears or (None,) * len(arm.joints) for arm in (first, second)]
         self.gears = (*told[0], *told[1])
+        if first.motors or second.motors:
+            n = len(first.joints)
+            turns = np.eye(len(self.joints))
+            for arm, at in ((first, slice(None, n)), (second, slice(n, None))):
+                turns[at, at] = arm.motors or turns[at, at]
+            self.motors = tuple(map(tuple, turns.tolist()))
 
     def _own_file(self) -> dict[str, Any]:
         return {"spec": "pair", "keys": {"first": self.first.describe(), "second": self.second.describe()}}

@@ -16,6 +16,7 @@ from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.branches import commanded_joints
 from ccnn_torch.mechanisms.closest import Closest
+from ccnn_torch.mechanisms.gears import moved_by, read_motors
 from ccnn_torch.mechanisms.machines.drives import Drives
 from ccnn_torch.mechanisms.machines.links import (
     LINKS,
@@ -25,6 +26,7 @@ from ccnn_torch.mechanisms.machines.links import (
     compose,
     counting,
     lean_screws,
+    link_frames_of,
     links_and_drives,
     parallel_to_next,
     start_and_shares,
@@ -34,7 +36,6 @@ from ccnn_torch.mechanisms.machines.links import (
 from ccnn_torch.mechanisms.pose import Frame
 from ccnn_torch.numerics.batching import stack_last
 from ccnn_torch.numerics.rotations import (
-    matrix_to_euler_zyx,
     matrix_to_rotation_vector,
     rotation_vector_rate,
     rotation_vector_to_matrix,
@@ -45,7 +46,7 @@ MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
 
 # Keys of a description that is older than these, or has none of them, are not there.
-_WHERE_GIVEN = ("goal_tool", "tables", "leans", "masses", "centres", "gears")
+_WHERE_GIVEN = ("goal_tool", "tables", "leans", "masses", "centres", "gears", "motors")
 FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
 
@@ -112,6 +113,7 @@ class SerialArm(Closest):
         masses: Sequence[float] = (),
         centres: Sequence[Sequence[float]] = (),
         gears: Sequence[float | None] = (),
+        motors: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
         """Build from plain numbers [SI].
 
@@ -127,6 +129,7 @@ class SerialArm(Closest):
             goal_tool: the tool that commanded poses are of, position and rotation vector; `tool` when None.
             limits: lowest and highest value per joint, for sampling only; a full turn or a metre when None.
             unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight, drives, gears: see class.
+            motors: as of `read_motors`.
             tables: of each joint the places and the errors of its pitch-error table there, or None.
             leans: pairs of a link (from 1), see the class, and its lean [rad].
             masses: of the links, `n` [kg]; unknown when there are none.
@@ -154,8 +157,11 @@ class SerialArm(Closest):
         self._transform, _, _, self._axis_before = LINKS[convention]
         pose = FRAME if orientation == "rotation_vector" else FRAME[:3]
         geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(FRAME, base, strict=True)]
-        joint_units = ["rad" if t == "revolute" else "m" for t in types]
-        own = links_and_drives(convention, links, joint_units, drives, leans, orientation == "direction")
+        joints = [Coordinate(f"q{i}", "rad" if t == "revolute" else "m") for i, t in enumerate(types, 1)]
+        driven = read_motors(motors, joints, f"arm '{name}': motors") if motors else ()
+        # A ratio that the controller has a little wrong moves one joint by another one.
+        drives = [*drives, *([] if numbers else moved_by(driven))]
+        own = links_and_drives(convention, links, [j.unit for j in joints], drives, leans, orientation == "direction")
         start, shares = start_and_shares(own, numbers)
         if numbers:
             own = [Parameter(**{k: v for k, v in number.items() if k != "of"}) for number in numbers]
@@ -167,7 +173,7 @@ class SerialArm(Closest):
         ]
         super().__init__(
             name=name,
-            joints=[Coordinate(f"q{i + 1}", unit) for i, unit in enumerate(joint_units)],
+            joints=joints,
             pose=[Coordinate(c, u) for c, u in pose],
             geometry=geometry,
             low=[-math.pi] * len(pose),
@@ -176,7 +182,8 @@ class SerialArm(Closest):
         )
         self.convention, self.orientation, self.rotation_weight = convention, orientation, rotation_weight
         self.unknown_frames, self.parallel_axes = tuple(sorted(unknown)), tuple(map(tuple, parallel_axes))
-        self.frame_per, self.tool_per, self.gears = tuple(frame_per), tuple(tool_per), tuple(gears)
+        self.frame_per, self.tool_per = tuple(frame_per), tuple(tool_per)
+        self.gears, self.motors = tuple(gears), driven
         span = limits or [(-math.pi, math.pi) if t == "revolute" else (0.0, 1.0) for t in types]
         self.register_buffer("axes", torch.tensor(axes or [[0.0, 0.0, 1.0]] * n, dtype=torch.float64))
         self.register_buffer("signs", torch.tensor(joint_sign or [1.0] * n, dtype=torch.float64))
@@ -255,34 +262,26 @@ class SerialArm(Closest):
         if self.convention == "urdf":
             return self
         keys, zero = self.recipe["keys"], torch.zeros(len(self.joints), dtype=torch.float64)
-        rotations, places = self.link_transforms(zero, self.nominal)
-        angles = matrix_to_euler_zyx(rotations).flip(-1)
-        links = torch.cat([places, angles], dim=-1)
-        before, centres = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)), self._centres
-        if self._axis_before:
-            centres = (rotations @ centres.unsqueeze(-1)).squeeze(-1) + places
-            links = torch.cat([torch.zeros_like(links[:1]), links[:-1]])
-            before = rotations[-1], places[-1]
-
-        def from_last(frame: Tensor) -> list[float]:
-            turn, place = compose(before, transform_of(frame))
-            return [*place.tolist(), *matrix_to_rotation_vector(turn).tolist()]
-
+        there = link_frames_of(self.link_transforms(zero, self.nominal), self._centres, self._axis_before)
         goal = keys.get("goal_tool")
-        return SerialArm(
+        twin = SerialArm(
             **{
                 **keys,
                 "convention": "urdf",
                 "leans": [],
-                "links": links.tolist(),
+                "links": there.links,
                 "base": self.nominal[:6].tolist(),
-                "tool": from_last(self.nominal[-6:]),
-                "goal_tool": None if goal is None else from_last(torch.tensor(goal, dtype=torch.float64)),
+                "tool": there.from_last(self.nominal[-6:]),
+                "goal_tool": None if goal is None else there.from_last(torch.tensor(goal, dtype=torch.float64)),
                 "tool_offset": None,
                 "unknown_frames": list(self.unknown_frames),
-                "centres": [[] if math.isnan(one[0]) else one for one in centres.tolist() if "centres" in keys],
+                "centres": there.centres if "centres" in keys else [],
             }
         )
+        if self.drives:
+            twin.nominal[-6 - len(self.drives) : -6] = self.of_drives(self.nominal)
+            twin._follow_nominal()
+        return twin
 
     def with_orientation(self, orientation: str) -> SerialArm:
         """The same arm, nominal parameters included, for poses of another kind: "none", "direction" …"""
