@@ -6,9 +6,8 @@ stand the temperature of the arm, the payload and each axis' last direction. The
 lengths, twists, zeros, reducers once and twice a motor's turn and bevel gears in the wrist, each on the shafts it sits
 on, ratios of coupling a little off, joints and a bearing that give under weight, lost motion, growth, a stand that
 drifts. Ours (`ccnn run`, by the written file) has the Denavit-Hartenberg table; "sheet" also gears, masses and centres,
-"loads" also the moments of the tools, "ways" has directions of motors in the place of axes', "shafts" (only
-`--without tools`, one mirror for both) the user's own class `hollow_wrist_shafts.Wrist` whose joints are turns of the
-motors. The plain SciPy script (`hollow_wrist_script`) has lengths, twists, zeros and soft joints, the fuller one all
+"loads" also the moments of the tools, "motors" also the ratios of the shafts, and directions of motors in the place of
+axes'. The plain SciPy script (`hollow_wrist_script`) has lengths, twists, zeros and soft joints, the fuller one all
 causes ("no shafts": each on its joint; "signs": lost motion by direction alone, whatever the weight); also with a
 Gaussian process on what is left. Judged another day with a tool of 8 kg, in the frame and at the tool point that suit
 best, RMS and largest [µm]; "of a reading" is what a reading is off. `--without NAME` of
@@ -48,7 +47,7 @@ from ccnn_validation.hollow_wrist_robot import (
     Robot,
     sheet_frames,
 )  # fmt: skip
-from ccnn_validation.hollow_wrist_script import Told, by_process, corrected, fit, prefit
+from ccnn_validation.hollow_wrist_script import Told, by_process, corrected, fit
 
 Array = NDArray[np.float64]
 NEW, HOURS = 400, 3.0
@@ -74,15 +73,13 @@ tool_per: [tool]
 """
 SHEET = ARM + f"gears: {listed(GEARS)}\nmasses: {listed(MASSES)}\ncentres: {listed(CENTRES)}\n"
 PLAIN = "mechanism: machine.yaml\n"
-GEARED = f"mechanism: machine.py:Wrist\nmechanism_keys: {{gears: {listed(GEARS)}, allow_code: true}}\n"
-WRIST = (Path(__file__).parent / "hollow_wrist_shafts.py").read_text()
-# Of ours: its machine file, config, columns of loads, and whether joints are those of the motors.
+RATIOS = {"q5": {"q4": SHAFTS[1, 0]}, "q6": {"q4": SHAFTS[2, 0], "q5": SHAFTS[2, 1]}}
+# Of ours: its machine file, columns of loads, and whether directions are those of the motors.
 OURS = {
-    "ours": (ARM, PLAIN, False, False),
-    "ours, sheet": (SHEET, PLAIN, False, False),
-    "ours, loads": (SHEET, PLAIN, True, False),
-    "ours, ways": (SHEET, PLAIN, False, False),
-    "ours, shafts": (WRIST, GEARED, True, True),
+    "ours": (ARM, False, False),
+    "ours, sheet": (SHEET, False, False),
+    "ours, loads": (SHEET, True, False),
+    "ours, motors": (f"{SHEET}motors: {json.dumps(RATIOS)}\n", False, True),
 }
 SCRIPTS = (
     (False, "plain script"),
@@ -130,14 +127,12 @@ def table(
     time: Array,
     way: Array,
     loads: bool,
-    motors: bool,
     turn: Array,
     seen: Array | None,
 ) -> tuple[str, Array]:
     """Header and rows of a file; `turn`: of the robot in the tracker's frame, for loads by the data sheet."""
-    shown = shafts(joints) if motors else joints
     names = [f"q{k}[deg]" for k in range(1, 7)] + [f"direction{k}[1]" for k in range(1, 7)] + ["temperature[degC]"]
-    parts = [np.degrees(shown), way, (20 + warmth)[:, None]]
+    parts = [np.degrees(joints), way, (20 + warmth)[:, None]]
     mass = np.array([TOOLS[int(k)][0] for k in kind])
     if loads:
         last = sheet_frames(joints)[:, 6]
@@ -185,23 +180,16 @@ def judged(
             file=sys.stderr,
         )
     for who in names:
-        machine, config, loads, motors = OURS[who]
+        machine, loads, motors = OURS[who]
         machine = machine.replace("tool_per: [tool]\n", "") if "tools" in without else machine
         start, turn = clock.time(), robot.turn.as_matrix()
-        rows_seen = prefit(joints, kind, seen) if motors else seen
-        turned = motors or who == "ours, ways"
-        ended = [ways(shafts(q) if turned else q) for q in (joints, wanted)]
-        records = table(joints, kind, warmth, time, ended[0], loads, motors, np.eye(3) if motors else turn, rows_seen)
-        targets = table(
-            wanted, third, then, np.zeros(NEW), ended[1], loads, motors, np.eye(3) if motors else turn, None
-        )
+        ended = [ways(shafts(q) if motors else q) for q in (joints, wanted)]
+        records = table(joints, kind, warmth, time, ended[0], loads, turn, seen)
+        targets = table(wanted, third, then, np.zeros(NEW), ended[1], loads, turn, None)
         with TemporaryDirectory() as folder:
             place = Path(folder) if kept is None else kept / str(seed) / who.replace(", ", "_").replace(" ", "_")
             place.mkdir(parents=True, exist_ok=True)
-            file, flags = ("machine.yaml", "") if not motors else ("machine.py", "--allow-code")
-            found = commanded(place, machine, records, targets, "run", config, file, flags)
-        if found is not None and motors:
-            found = np.c_[found[:, :3], found[:, 3:] @ np.linalg.inv(SHAFTS).T]
+            found = commanded(place, machine, records, targets, "run", PLAIN)
         sent[who] = np.full_like(wanted, np.nan) if found is None else found
         print(f"  {who}: {clock.time() - start:.0f} s", file=sys.stderr)
     off: dict[str, list[float]] = {}
@@ -220,7 +208,7 @@ def main() -> None:
     options.add_argument("--rows", type=int, default=60)
     options.add_argument("--without", nargs="*", choices=CAUSES, default=[])
     options.add_argument("--keep", type=Path)
-    options.add_argument("--ours", default=";".join(list(OURS)[:3]), help="names between semicolons")
+    options.add_argument("--ours", default=";".join(OURS), help="names between semicolons")
     given = options.parse_args()
     names = [name for name in given.ours.split(";") if name]
     every = []

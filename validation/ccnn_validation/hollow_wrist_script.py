@@ -48,14 +48,6 @@ def split(x: Array) -> dict[str, Array]:
     return dict(zip(GROUPS, np.split(x, ends[:-1]), strict=True))
 
 
-def prefit(joints: Array, kind: Array, seen: Array) -> Array:
-    """Rows in the robot's base by the data sheet alone, best frame and points, `s x 3` [m]."""
-    last = sheet_frames(joints)[:, 6]
-    at = (last[:, :3, :3] @ POINTS[kind][..., None])[..., 0] + last[:, :3, 3]
-    turn, _ = Rotation.align_vectors(seen - seen.mean(0), at - at.mean(0))
-    return np.asarray(turn.inv().apply(seen - seen.mean(0)) + at.mean(0))
-
-
 def flange(x: Array, joints: Array, told: Told) -> Array:
     """Frames of the last link in the base, `s x 4 x 4`."""
     n, (kind, warmth, direction, _, given, more) = split(x), told
