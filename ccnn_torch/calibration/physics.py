@@ -21,7 +21,7 @@ from ccnn_torch.diagnosis.from_file import (
     usable_verdict,
     with_numbers,
 )
-from ccnn_torch.diagnosis.from_records import in_own_base, named_mistake, situation_of, with_orientation
+from ccnn_torch.diagnosis.from_records import in_own_base, named_mistake, of_commands, situation_of
 from ccnn_torch.diagnosis.joint_fit import effects_that_pay, fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.diagnosis.residual.linearisation import remainder
 from ccnn_torch.diagnosis.residual.rows import picked
@@ -134,10 +134,7 @@ class Physics:
             InputError, MethodFailedError: see `machine_of`.
         """
         there, values = self.in_own_base(repeat, rows)
-        # Commands are for whole poses, whatever of them was measured; but of a tool that was seen in part the rest is
-        # not known.
-        same = (len(a.effect.coefficients(there.whole)) == len(a.coefficients) for a in self.acting[repeat])
-        there = with_orientation(there.visits if all(same) else there)
+        there = of_commands(there, self.acting[repeat])
         values = values[: len(there.mechanism.geometry)]
         return machine_of(there, self.acting[repeat], values, covariates, margin)
 

@@ -39,8 +39,8 @@ from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import (
     BlackBox,
     Framed,
-    Instrument,
     Mechanism,
+    Seen,
     SerialArm,
     as_measured,
     fit_unknown,
@@ -388,22 +388,25 @@ def named_machine(said: Diagnosis) -> dict[str, Any] | None:
             situation, values = in_own_base(situation, values[0])
         used = used_covariates(situation, acting)
         situation = replace(situation, covariates={n: v for n, v in situation.covariates.items() if n in used})
-        if isinstance(situation.mechanism, Instrument):
-            situation = situation.visits
-            values = values[..., : len(situation.mechanism.geometry)]
-        situation = with_orientation(situation)
+        situation = of_commands(situation, acting)
+        if isinstance(situation.mechanism, Seen):
+            return None
+        values = values[..., : len(situation.mechanism.geometry)]
         return found_block(situation, values, acting, covariate_units(situation.mechanism, used))
     except InputError:
         # A machine that no file describes, or an effect that needs what was before a row.
         return None
 
 
-def with_orientation(situation: Situation) -> Situation:
-    """Rows of an arm of which positions were measured, on the arm with its whole pose; others as they are.
+def of_commands(situation: Situation, acting: Sequence[Acting]) -> Situation:
+    """The rows on the machine with its whole pose, whatever of it was measured: commands are for whole poses.
 
-    Another tool is at its place only where the orientation is right as well. Three joints or fewer are all needed for
-    the position.
+    Of an arm of which positions were measured another tool is at its place only where the orientation is right as well;
+    three joints or fewer are all needed for the position. Rows stay as they are where an effect is of what was seen
+    alone, as of a tool that was seen in part.
     """
+    if all(len(a.effect.coefficients(situation.whole)) == len(a.coefficients) for a in acting):
+        situation = situation.visits
     arm = situation.mechanism
     if not isinstance(arm, SerialArm) or arm.orientation != "none" or len(arm.joints) < 4:
         return situation

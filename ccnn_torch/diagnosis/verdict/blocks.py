@@ -185,6 +185,8 @@ def _derivative(situation: Situation, there: Situation, atom: Atom, mean: Tensor
 _UNSEEN = 0.1
 # Times what a verdict leaves that a part of its numbers may leave.
 _KEPT = 1.2
+# Times the largest number of the fit that one may be when fewer do the same.
+_LARGER = 3.0
 # Share by which the gains of numbers that do the same may differ.
 _TIE = 1e-6
 
@@ -193,6 +195,8 @@ def fewest(gram: Tensor, mean: Tensor, spread: Tensor, noise: float) -> tuple[Te
     """Numbers of a model that do to the rows what all of them do, as few as can be found one by one.
 
     Some numbers do the very same to all poses, as shifts along parallel axes do, and a fit spreads an error over them.
+    Others do nearly the same: metres of one less those of another would be a millimetre of a third, and are no way to
+    tell it.
 
     Args:
         gram: inner products of what the numbers do, each by its plausible size, `m x m`.
@@ -204,9 +208,11 @@ def fewest(gram: Tensor, mean: Tensor, spread: Tensor, noise: float) -> tuple[Te
     """
     deviation = spread.diagonal().clamp_min(0).sqrt()
     target, chosen, found = gram @ mean, torch.zeros(len(mean), dtype=torch.bool), torch.zeros_like(mean)
+    most = _LARGER * max(float(mean.abs().amax()), 1.0)
 
     def unseen(these: Tensor, values: Tensor) -> bool:
-        return float((values - these) @ gram @ (values - these)) <= _UNSEEN * noise
+        same = float((values - these) @ gram @ (values - these)) <= _UNSEEN * noise
+        return same and float(these.abs().amax()) <= most
 
     def solved(these: Tensor) -> Tensor:
         values = torch.zeros_like(mean)
@@ -216,8 +222,9 @@ def fewest(gram: Tensor, mean: Tensor, spread: Tensor, noise: float) -> tuple[Te
     while not unseen(found, mean):
         cross = gram[chosen]
         free = gram.diagonal() - (cross * torch.linalg.solve(gram[chosen][:, chosen], cross)).sum(0)
-        gain = (target - gram @ found).square() / free
-        gain[chosen | (free <= _UNSEEN * noise)] = 0.0
+        lacking = target - gram @ found
+        gain = lacking.square() / free
+        gain[chosen | (free <= _UNSEEN * noise) | (lacking.abs() > most * free)] = 0.0
         if not bool((gain > 0).any()):
             return mean, deviation
         # Of numbers that do the same the first, whatever the rounding.
