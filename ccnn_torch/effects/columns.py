@@ -120,10 +120,15 @@ def twist_columns(situation: Situation, arm: Tensor, axes: Tensor) -> Tensor:
     """
     shift = torch.cat([axes, -skew(arm) @ axes], -1)
     turn = torch.cat([torch.zeros_like(axes), axes], -1)
+    return as_shown(situation, torch.cat([shift, turn], -2))
+
+
+def as_shown(situation: Situation, motion: Tensor) -> Tensor:
+    """Small shifts of the measured point and turns of its frame `... x s x 6 x m` [m, rad], as the pose or the
+    instruments show them, `... x s x c x m`."""
     if isinstance(situation.mechanism, Instrument):
-        return situation.by_place @ torch.cat([shift, turn], -2)
-    whole = shift if situation.visible.shape[-1] == 3 else torch.cat([shift, turn], -2)
-    return situation.visible @ whole
+        return situation.by_place @ motion
+    return situation.visible @ motion[..., : situation.visible.shape[-1], :]
 
 
 def shown_columns(situation: Situation, columns: Callable[[Situation], Tensor]) -> list[int]:

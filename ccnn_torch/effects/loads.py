@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import force_of, is_temperature, per_force, torque_of
-from ccnn_torch.effects.columns import by_joint, inside, own_parameters
+from ccnn_torch.effects.columns import as_shown, by_joint, inside, own_parameters
 from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation, arm_axes, load_columns
 from ccnn_torch.mechanisms import Mechanism, SerialArm, sees_directions
@@ -119,7 +119,7 @@ class Compliance(Effect):
             for part in ("", " stiffening", " hardening")
             for j in mechanism.joints
         ]
-        if isinstance(mechanism, SerialArm):
+        if isinstance(inside(mechanism), SerialArm):
             tilt, away = GIVE["rad"] * _SECONDARY, GIVE["rad"] * _AWAY
             turning = [mechanism.joints[i].name for i in _turning(mechanism)]
             return (
@@ -136,7 +136,7 @@ class Compliance(Effect):
         typical = torch.tensor([_TYPICAL[j.unit] for j in situation.mechanism.joints], dtype=torch.float64)
         ratio = torque.abs() / typical
         parts = [jacobian * (torque * ratio**k).unsqueeze(-2) for k in range(3)]
-        arm = isinstance(situation.mechanism, SerialArm)
+        arm = isinstance(inside(situation.mechanism), SerialArm)
         return torch.cat([*parts, *_of_an_arm(situation)] if arm else [*parts, _stretching(situation)], -1)
 
 
@@ -227,22 +227,22 @@ def _turning(mechanism: Mechanism) -> list[int]:
 def _of_an_arm(situation: Situation) -> list[Tensor]:
     """Change of the pose by links that tilt at their joints, `... x s x c x n`, and by joints that give under the
     moment of a load that acts 1 m away from the measured point along each axis of the tool, `... x s x c x 3t`."""
-    arm = situation.mechanism
+    arm, whole = situation.whole.mechanism, situation.whole
     assert isinstance(arm, SerialArm)
-    points, axes = arm_axes(arm, situation.joints, arm.resolve(situation.parameters))
+    points, axes = arm_axes(arm, situation.joints, arm.resolve(whole.parameters))
     place, rotation = situation.platform
     if rotation is None:
         # Only what a changed file describes.
         raise ValueError("an arm whose frame has no orientation")
     lever = place.unsqueeze(-2) - points
-    wrench = situation.wrench.unsqueeze(-2)
+    wrench = whole.wrench.unsqueeze(-2)
     force = wrench[..., :3]
     moment = torch.linalg.cross(*torch.broadcast_tensors(lever, force), dim=-1)  # type: ignore[no-untyped-call]
     if wrench.shape[-1] == 6:
         moment = moment + wrench[..., 3:]
     across = moment - (moment * axes).sum(-1, keepdim=True) * axes
     shift = torch.linalg.cross(across, lever, dim=-1)
-    tilting = torch.cat([shift, across], -1)[..., : situation.jacobian.shape[-2]].mT
+    tilting = as_shown(situation, torch.cat([shift, across], -1).mT)
     away = torch.linalg.cross(*torch.broadcast_tensors(rotation.mT, force), dim=-1)  # type: ignore[no-untyped-call]
     turning = _turning(arm)
     torque = (axes @ away.mT)[..., turning, :]
@@ -409,7 +409,7 @@ class Bending(Effect):
             angle = (tilts @ below.mT.unsqueeze(-3)).squeeze(-1)
             tilted.append(torch.cat([_cross(angle, tool - foot), angle], -1))
         columns = torch.cat([torch.cat([*bent, own], -2).flatten(-3, -2), *tilted], -2)
-        return situation.visible @ columns[..., : situation.jacobian.shape[-2]].mT
+        return as_shown(situation, columns.mT)
 
 
 def _of_beam(

@@ -35,6 +35,19 @@ def test_numbers_that_cannot_be_told_apart_are_left_as_fitted():
     assert values.equal(mean) and errors.tolist() == [1.0] * 3
 
 
+def test_two_that_differ_by_little_do_not_stand_for_a_third_one():
+    """Ten metres of one less ten of the other would do what a millimetre of the third does."""
+    generator = torch.Generator().manual_seed(2)
+    own = torch.randn(200, 3, generator=generator, dtype=torch.float64)
+    columns = torch.stack([own[:, 0], own[:, 0] + 1e-4 * own[:, 1], own[:, 1], own[:, 2]], -1)
+    mean = torch.tensor([1.0, -1.0, 2.0, 1.0], dtype=torch.float64)
+    for order in ([0, 1, 2, 3], [2, 0, 1, 3], [1, 3, 0, 2]):
+        one = columns[:, order]
+        values, _ = fewest(one.mT @ one, mean[order], torch.eye(4, dtype=torch.float64), 1e-9)
+        assert float(values.abs().max()) <= 10 * 2.0
+        assert float((one @ (values - mean[order])).square().sum()) < 1e-9
+
+
 def test_numbers_have_to_be_entered_together_until_they_leave_what_is_promised():
     gram = torch.eye(4, dtype=torch.float64)
     mean = torch.tensor([1.0, -4.0, 3.0, 0.1], dtype=torch.float64)

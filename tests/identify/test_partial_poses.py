@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -59,6 +61,31 @@ def test_heights_of_a_bed_alone_make_it_flat_where_no_probe_was(tmp_path: Path) 
     assert float(before.std()) > 3e-5
     # Twenty-one numbers from 140 rows.
     assert float(after.square().mean().sqrt()) < 0.7 * NOISE
+
+
+def test_commands_of_a_verdict_about_heights_alone_go_to_x_and_y_as_well(
+    cli: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    nominal, truth = _printer()
+    joints = nominal.solve_inverse(_bed(60, 0), truth)
+    noise = NOISE * torch.randn(60, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    table = {f"q{k + 1}[m]": joints[:, k].numpy() for k in range(3)} | {"z[m]": noise.numpy()}
+    write_table(tmp_path / "bed.csv", table)
+    config = f"records: bed.csv\nmechanism: delta_linear\nmechanism_keys: {KEYS}\n"
+    (tmp_path / "c.yaml").write_text(config)
+    said = cli(
+        "diagnose", "--config", tmp_path / "c.yaml", "--no-network", "--effects", "geometry", "--out", tmp_path / "d"
+    )
+    assert said[0] == 0, said
+    wanted = _bed(20, 3)
+    write_table(tmp_path / "t.csv", dict(zip(("x[m]", "y[m]", "z[m]"), wanted.T.numpy(), strict=True)))
+    made = cli("compensate", tmp_path / "d/diagnosis.json", tmp_path / "t.csv", tmp_path / "c.csv", "--pose")
+    assert made[0] == 0, made
+    sent = np.genfromtxt(tmp_path / "c.csv", delimiter=",", names=True, deletechars="")
+    commands = torch.tensor(np.stack([sent[f"command_q{k}[m]"] for k in (1, 2, 3)], -1))
+    there = nominal.forward_kinematics(commands, truth)
+    assert float((there - wanted)[:, :2].abs().max()) < 2e-3
+    assert float((there - wanted)[:, 2].square().mean().sqrt()) < 2 * NOISE
 
 
 def test_poses_are_compared_where_the_joints_of_a_pose_are_not_unique() -> None:

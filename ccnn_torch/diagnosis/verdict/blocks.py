@@ -185,8 +185,8 @@ def _derivative(situation: Situation, there: Situation, atom: Atom, mean: Tensor
 _UNSEEN = 0.1
 # Times what a verdict leaves that a part of its numbers may leave.
 _KEPT = 1.2
-# Times the largest number of the fit that one may be when fewer do the same.
-_LARGER = 3.0
+# Times the largest number of the fit that one may be when fewer do the same: so many may have shared an error.
+_LARGER = 10.0
 # Share by which the gains of numbers that do the same may differ.
 _TIE = 1e-6
 
