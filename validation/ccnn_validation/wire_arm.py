@@ -118,7 +118,8 @@ def searched(folder: Path, visit: Visit, read: Array, after: Visit) -> Array:
         at = folder / f"try{number}"
         commanded(**written(at, "searched", visit, read - start, after))
         pose = json.loads((at / "run" / "results.json").read_text())["pose"]["position"]
-        left.append(pose["explained"]["rms"]["median"] ** 2)
+        # What the effects leave: that of the file may be far worse.
+        left.append(pose.get("effects", pose["geometry"])["rms"]["median"] ** 2)
     u, v = (tried / step).T
     c = np.linalg.solve(np.c_[np.ones(6), u, v, u * u, v * v, u * v], left)
     return np.asarray(step * np.linalg.solve([[2 * c[3], c[5]], [c[5], 2 * c[4]]], -c[1:3]))
