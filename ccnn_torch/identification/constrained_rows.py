@@ -200,7 +200,7 @@ def _reading(about: Kind, mechanism: Mechanism, at: Tensor, read: Tensor, group:
     """What reads rows of a kind; at `s x 3`: the tool, read `s x c` [SI], group: number of each row's, `s`."""
     numbers = torch.unique(group).tolist()
     if about.kind == "distances":
-        return Between(mechanism) if paired else Wire(numbers)
+        return Between(mechanism) if paired else Wire(numbers, zero=0.0)
     if about.kind == "plane":
         return Dial([[0.0, 0.0, 1.0]] * len(numbers), numbers)
     distinct = torch.unique(read, dim=0)

@@ -146,7 +146,7 @@ def test_distances_from_an_unknown_anchor() -> None:
     which = (torch.arange(240) % 2).to(torch.float64)
     distance = torch.linalg.vector_norm(tool_points(arm, joints, truth) - anchors[which.long()], dim=-1)
     weights = (torch.arange(240) < 200).to(torch.float64)
-    problem = read(arm, Wire([0, 1]), joints, torch.stack([distance, which], -1), weights)
+    problem = read(arm, Wire([0, 1], zero=0.0), joints, torch.stack([distance, which], -1), weights)
     fit = solve_lm(problem)
     held = problem.residual(fit.values[:, None], *problem.data)[0, 200:, 0] * 1e-7
     start = problem.residual(problem.start[:, None], *problem.data)[0, 200:, 0] * 1e-7
@@ -203,7 +203,7 @@ def test_bad_input_is_one_sentence() -> None:
     arm, truth = machine()
     joints, placement, points = seats(arm, truth)
     rows = torch.stack([points[:3, 0], placement[:3]], -1)
-    for reading, name in ((Wire([0]), "anchor"), (Dial([[0, 0, 1]], [0]), "plane")):
+    for reading, name in ((Wire([0], zero=0.0), "anchor"), (Dial([[0, 0, 1]], [0]), "plane")):
         with pytest.raises(InputError, match=f"{name} 0: needs at least 4 rows that count, got 3"):
             read(arm, reading, joints[:3], rows)
     with pytest.raises(InputError, match="no row that counts"):

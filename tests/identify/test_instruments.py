@@ -275,7 +275,7 @@ def test_what_no_instrument_can_be_is_refused(tmp_path: Path) -> None:
     arm = str(arm_file(tmp_path, frames=False))
     for keys, said in (
         ({"kind": "sextant"}, "no instrument 'sextant'; write one of camera, wire, dial, level, encoder"),
-        ({"kind": "wire", "ropes": 2}, "a wire has no key 'ropes'; it has anchors"),
+        ({"kind": "wire", "ropes": 2}, "a wire has no key 'ropes'; it has anchors, zero"),
         ({"kind": "wire", "anchors": 0}, "anchors: 0 is no number of them"),
         ({"kind": "encoder", "joint": "q9"}, "there is no joint 'q9'; write one of q1, q2"),
         ({"kind": "level", "link": 9}, "link: 9 is no link of own; write 0 to 6"),
@@ -317,8 +317,8 @@ def test_a_gauge_reads_heights_over_its_plane() -> None:
 @pytest.mark.parametrize("keys", [{"kind": "level"}, {"kind": "wire", "anchors": 2}])
 def test_poses_are_planned_for_an_instrument(tmp_path: Path, keys: dict[str, Any]) -> None:
     machine = load_mechanism("instrument", mechanism=str(arm_file(tmp_path, frames=False)), **keys)
-    _, plans = make_plan(machine, 24, PlanConfig.from_file(None, ["candidates=60"]))
-    assert plans[0].joints.shape == (24, 6) and len(torch.unique(plans[0].joints, dim=0)) == 24
+    _, plans = make_plan(machine, 26, PlanConfig.from_file(None, ["candidates=60"]))
+    assert plans[0].joints.shape == (26, 6) and len(torch.unique(plans[0].joints, dim=0)) == 26
     assert bool(torch.isfinite(plans[0].pose).all())
     if keys["kind"] == "wire":
         assert set(plans[0].pose[:, 1].tolist()) == {1.0, 2.0}

@@ -66,16 +66,16 @@ def test_heights_of_a_bed_alone_make_it_flat_where_no_probe_was(tmp_path: Path) 
 def test_commands_of_a_verdict_about_heights_alone_go_to_x_and_y_as_well(
     cli: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
-    nominal, truth = _printer()
-    joints = nominal.solve_inverse(_bed(60, 0), truth)
-    noise = NOISE * torch.randn(60, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    nominal, _ = _printer()
+    truth = nominal.nominal.clone()
+    truth[[p.name for p in nominal.geometry].index("rod1")] += 2e-3
+    joints = nominal.solve_inverse(_bed(80, 0), truth)
+    noise = NOISE * torch.randn(80, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     table = {f"q{k + 1}[m]": joints[:, k].numpy() for k in range(3)} | {"z[m]": noise.numpy()}
     write_table(tmp_path / "bed.csv", table)
-    config = f"records: bed.csv\nmechanism: delta_linear\nmechanism_keys: {KEYS}\n"
+    config = f"records: {tmp_path / 'bed.csv'}\nmechanism: delta_linear\nmechanism_keys: {KEYS}\n"
     (tmp_path / "c.yaml").write_text(config)
-    said = cli(
-        "diagnose", "--config", tmp_path / "c.yaml", "--no-network", "--effects", "geometry", "--out", tmp_path / "d"
-    )
+    said = cli("diagnose", "--config", tmp_path / "c.yaml", "--no-network", "--out", tmp_path / "d")
     assert said[0] == 0, said
     wanted = _bed(20, 3)
     write_table(tmp_path / "t.csv", dict(zip(("x[m]", "y[m]", "z[m]"), wanted.T.numpy(), strict=True)))
@@ -83,9 +83,10 @@ def test_commands_of_a_verdict_about_heights_alone_go_to_x_and_y_as_well(
     assert made[0] == 0, made
     sent = np.genfromtxt(tmp_path / "c.csv", delimiter=",", names=True, deletechars="")
     commands = torch.tensor(np.stack([sent[f"command_q{k}[m]"] for k in (1, 2, 3)], -1))
-    there = nominal.forward_kinematics(commands, truth)
-    assert float((there - wanted)[:, :2].abs().max()) < 2e-3
-    assert float((there - wanted)[:, 2].square().mean().sqrt()) < 2 * NOISE
+    before, after = (nominal.forward_kinematics(q, truth) - wanted for q in (nominal.solve_inverse(wanted), commands))
+    # Heights show less of x and y; commands once went to the middle of the bed, whatever was wanted.
+    assert float(after[:, :2].abs().max()) < 4e-3
+    assert float(after[:, 2].square().mean()) < 0.2**2 * float(before[:, 2].square().mean())
 
 
 def test_poses_are_compared_where_the_joints_of_a_pose_are_not_unique() -> None:

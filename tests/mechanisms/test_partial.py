@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from arm_text import arm_text
 from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate, Parameter
@@ -124,3 +125,33 @@ def test_more_drives_than_coordinates_have_the_pose_that_closes_best() -> None:
     torch.testing.assert_close(
         (slope.mT @ machine.closure(found, off)[..., None])[..., 0], torch.zeros_like(found), rtol=0, atol=1e-9
     )
+
+
+def test_what_bends_and_gives_shows_in_wires_as_it_moves_the_hook(tmp_path: Path) -> None:
+    """By the difference of distances themselves; a wire was once read as if its distance were the first coordinate."""
+    (tmp_path / "arm.yaml").write_text(arm_text("base_frame: identity\ntool_frame: [0.03, 0, 0.12, 0, 0, 0]\n"))
+    wires = load_mechanism("instrument", mechanism=str(tmp_path / "arm.yaml"), kind="wire", anchors=2, zero=0)
+    own = [p.name for p in wires.geometry]
+    values = dict(zip(own, wires.nominal.tolist(), strict=True))
+    eyes = {"anchor1": (1.4, -0.8, 0.2), "anchor2": (1.2, 1.0, 0.1)}
+    wires.set_parameters(values | {f"{n}_{a}": v for n, at in eyes.items() for a, v in zip("xyz", at, strict=True)})
+    arm = load_mechanism(str(tmp_path / "arm.yaml"))
+    joints = arm.sample_joints(8, torch.Generator().manual_seed(3))
+    pull = {"load_z": torch.linspace(-80, -20, 8, dtype=torch.float64), "load_x": torch.full((8,), 7.0).double()}
+    which = torch.tensor([1.0, 2] * 4, dtype=torch.float64)
+    guess = torch.stack([torch.ones(8, dtype=torch.float64), which], -1)
+    seen = Situation(wires, joints, pull, default_gravity(arm), guess=guess)
+    whole = Situation(arm, joints, pull, default_gravity(arm))
+    anchors = torch.tensor([eyes[f"anchor{int(n)}"] for n in which], dtype=torch.float64)
+    for name in ("compliance", "bending", "gravity", "frame"):
+        effect = make_effect(name)
+        names = [c.name for c in effect.coefficients(seen)]
+        assert names == [c.name for c in effect.coefficients(whole)], name
+        shown = {n: moved for n, moved in _columns(effect, whole).items() if float(moved.abs().max()) > 1e-12}
+        for label, moved in shown.items():
+            there = arm.forward_kinematics(joints)[:, :3] - anchors
+            step = 1e-6 / float(moved.abs().max())
+            far = [torch.linalg.vector_norm(there + sign * step * moved[:, :3], dim=-1) for sign in (1, -1)]
+            expected = (far[0] - far[1]) / (2 * step)
+            found = _columns(effect, seen)[label][:, 0]
+            torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7 * float(moved.abs().max()), msg=label)

@@ -23,6 +23,8 @@ from ccnn_torch.records.commanded import SECOND
 # Plausible errors: of a focal length and an image's centre as a share of it, of distortion, of a place that a tape
 # measured, of a mounting's turn.
 _FOCUS, _DISTORTION, _PLACE, _TURN = 0.01, 0.05, 0.02, 0.05
+# No zero of a wire is farther off [m].
+_LONGEST = 1.0
 PIXEL = 1e-6
 """A pixel counts as this length on the image [m], as columns in px are read."""
 # Numbers of a lens.
@@ -187,24 +189,34 @@ class Camera(Reading):
 
 
 class Wire(Reading):
-    """Distance of the tool's point from anchors at unknown places: a draw wire, a telescopic ball bar."""
+    """Distance of the tool's point from anchors at unknown places, and what it shows too much: a draw wire, whose drum
+    has a zero, a telescopic ball bar."""
 
     kind = "wire"
     read = (Coordinate("distance", "m"),)
     given = (Coordinate("anchor", "1"),)
 
-    def __init__(self, anchors: int | Sequence[float] = 1) -> None:
-        """How many anchors there are, which the column `anchor` numbers from 1; or their numbers there."""
+    def __init__(self, anchors: int | Sequence[float] = 1, zero: float = 1e-3) -> None:
+        """How many anchors there are, which the column `anchor` numbers from 1, or their numbers there; and how far the
+        zero of a distance may be off [m], 0 of one that is exact."""
+        if isinstance(zero, bool) or not isinstance(zero, (int, float)) or not 0 <= zero <= _LONGEST:
+            raise InputError(f"zero: how far a wire's zero may be off, in m from 0 to {_LONGEST:g}, not {zero!r}")
         self.groups = _numbers(anchors, "anchors")
-        self.keys = {"anchors": anchors}
+        self.keys = {"anchors": anchors, "zero": zero}
         self.unknown = tuple(f"anchor{n:g}" for n in self.groups)
         self.usual = (self.groups[0],)
         self.parameters = tuple(
             Parameter(f"{name}_{axis}", "m", 0.0, scale=_PLACE) for name in self.unknown for axis in "xyz"
         )
+        if zero:
+            # Of its own name: it is no part of where the anchor is, which is fitted before anything else.
+            zeros = (f"wire{n:g}_zero" for n in self.groups)
+            self.parameters += tuple(Parameter(n, "m", 0.0, scale=float(zero), cause="wire zero") for n in zeros)
 
     def __call__(self, place: Place, own: Tensor, given: Tensor) -> Tensor:
-        return _apart(place.position, chosen(own, given[..., 0], 3, self.groups))
+        groups, places = self.groups, 3 * len(self.groups)
+        far = _apart(place.position, chosen(own[..., :places], given[..., 0], 3, groups))
+        return far if own.shape[-1] == places else far + chosen(own[..., places:], given[..., 0], 1, groups)
 
     def start(self, place: Place, rows: Tensor, own: Tensor) -> Tensor:
         """|p|² - d² = 2 p·a - |a|² is linear in a and |a|²."""
