@@ -45,6 +45,9 @@ _MOST_STEPS, _DOUBLINGS, _FAR, _FEW = 12, 3, 0.5, 1e-3
 # Of the largest deviation in and around the domain: what the whole deviation may be. An arm whose elbow is nearer to
 # stretched than in any row needs twice as much, and is mistaken by more than a millimetre where it gets less.
 _ROOM = 3.0
+# Of the largest deviation of all joints of a unit: the least that counts for one of them. Where one joint alone is off,
+# the others move by little on the way to the command, and by nothing in the end.
+_BESIDE = 0.1
 
 
 # Share of the limit to which single precision is right.
@@ -286,7 +289,10 @@ def settle(compensator: Compensator, inputs: Tensor) -> None:
     machine.rule, (shares, correction, doubt) = kept, found
     near = doubt.squeeze(-1) <= ASTRAY
     largest = correction[near].abs().amax(0) if bool(near.any()) else compensator.limit
-    compensator.most.copy_(torch.maximum(_ROOM * largest, compensator.limit))
+    units = [joint.unit for joint in compensator.joints]
+    alike = torch.tensor([[a == b for b in units] for a in units])
+    others = _BESIDE * torch.where(alike, largest, 0.0).amax(-1)
+    compensator.most.copy_(torch.maximum(_ROOM * torch.maximum(largest, others), compensator.limit))
     # More steps settle few more.
     compensator.iterations = _enough(shares)
     compensator.unsettled = shares[-1]

@@ -16,7 +16,7 @@ from ccnn_torch.compensation import load_compensation
 from ccnn_torch.compensation.job import compensate_table
 from ccnn_torch.compensation.model_files.identified import model_of_machine
 from ccnn_torch.compensation.wanted import WantedPoses
-from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
+from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, measured_pose, reached
 from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import FiveBar
@@ -135,6 +135,21 @@ def test_legs_that_were_moved_far_are_not_drawn_one_by_one() -> None:
     # Legs that are drawn one by one turn the platform by up to 2.7 rad, and six in ten of them meet nowhere.
     turns = machine.forward_kinematics(drawn)[:, 3:].abs().amax(0)
     assert bool((turns < 2.2 * machine.sample_workspace(500, torch.Generator().manual_seed(1))[:, 3:].amax(0)).all())
+
+
+@pytest.mark.parametrize("name", ["delta_linear", "five_bar", "stewart"])
+def test_the_zero_of_one_joint_is_commanded_whole_where_all_others_are_right(name: str) -> None:
+    """What the others move on the way to the command bounded the whole of it: by nanometres."""
+    nominal = load_mechanism(name)
+    joints, none = nominal.sample_joints(40, torch.Generator().manual_seed(0)), torch.zeros(0, dtype=torch.float64)
+    zero = torch.zeros(len(nominal.joints), dtype=torch.float64)
+    zero[1] = 2e-3
+    ends = torch.stack([joints.amin(0), joints.amax(0)], -1)
+    effect, gravity = Acting(make_effect("joint_offset"), none, zero), default_gravity(nominal)
+    machine = FoundMachine(nominal, nominal.nominal.clone(), [effect], gravity, ends, (), none.reshape(0, 2), {}, {})
+    answer = model_of_machine(Path("found"), machine)(joints.numpy())
+    assert set(answer["status"].tolist()) <= {0, 1}
+    torch.testing.assert_close(torch.from_numpy(answer["command"]), joints - zero, rtol=0, atol=1e-8)
 
 
 def test_gravity_of_the_rows_is_that_of_the_machine(found: Path) -> None:
