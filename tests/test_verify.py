@@ -227,6 +227,19 @@ def test_the_limit_is_passed_once_in_twenty() -> None:
     assert 0.025 < passed / 400 < 0.085 and 0.025 < below / 400 < 0.085
 
 
+def test_a_mistyped_row_is_no_part_of_the_promise() -> None:
+    groups, generator = torch.arange(40), torch.Generator().manual_seed(0)
+    before, after = (s * torch.rand(40, generator=generator, dtype=torch.float64) + s for s in (1e-3, 4e-5))
+    plain = promise_block(PoseError(before[1:], None), PoseError(after[1:], None), groups[1:] - 1)
+    # One cell is off by 27 mm; and one row the model alone has wrong, which new rows may meet again.
+    after[1] = 1e-3
+    wrong = promise_block(PoseError(before[1:], None), PoseError(after[1:], None), groups[1:] - 1)
+    before[0] = after[0] = 0.027
+    mistyped = promise_block(PoseError(before, None), PoseError(after, None), groups)
+    assert plain is not None and wrong is not None and wrong == mistyped and mistyped["configurations"] == 39
+    assert wrong["position"]["rms"] > 1.5 * plain["position"]["rms"]
+
+
 def test_rows_at_one_configuration_count_once() -> None:
     joints = torch.from_numpy(np.repeat(np.random.default_rng(0).uniform(-1, 1, (5, 3)), 30, axis=0))
     groups = configurations(joints, load_mechanism(DELTA).joints)

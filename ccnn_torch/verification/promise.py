@@ -14,6 +14,7 @@ from torch import Tensor
 from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.results.verify import Middle, Promised, Repeated
 
@@ -60,6 +61,8 @@ def configurations(joints: Tensor, coordinates: Sequence[Coordinate]) -> Tensor:
 def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[str, Any] | None:
     """The entry `metrics`, `promise` of a model's card; None with fewer than two configurations.
 
+    Rows that are far off among the others with the model and without it are mistyped or mismeasured: they are no part.
+
     Args:
         before, after: pose error of the held-out rows, `s`; NaN where it was not measured.
         groups: configuration of each row, `s`, numbered from 0 without a gap.
@@ -68,7 +71,14 @@ def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[s
         `rows`, `configurations`, and `position` and `rotation` (None without), each `unit`, `before`, `rms` and
         `spread`: variance over squared mean of the squared error [1] of a configuration.
     """
-    count = int(groups.max()) + 1
+    lengths = torch.stack([before.position, after.position])
+    known = torch.isfinite(lengths)
+    near = (inlying(lengths.nan_to_num(), known, 3, 0) | ~known).any(0)
+    before, after = (
+        PoseError(e.position[near], None if e.rotation is None else e.rotation[near]) for e in (before, after)
+    )
+    groups = torch.unique(groups[near], return_inverse=True)[1]
+    count = int(groups.max()) + 1 if len(groups) else 0
     if count < 2:
         return None
 
