@@ -172,6 +172,19 @@ def test_a_tracker_that_was_moved(model: Path, tmp_path: Path) -> None:
     assert found["position"]["after"]["rms"] == pytest.approx(3**0.5 * NOISE, rel=0.2)
 
 
+@pytest.mark.parametrize(("swapped", "said"), [(("x[m]", "y[m]"), "x and y"), (("q1[rad]", "q3[rad]"), "q1 and q3")])
+def test_rows_with_swapped_columns_are_refused(
+    model: Path, tmp_path: Path, cli: Cli, swapped: tuple[str, str], said: str
+) -> None:
+    rows = delta_rows(tmp_path / "new.csv", seed=5)
+    header, rest = rows.read_text().split("\n", 1)
+    first, second = swapped
+    mixed = header.replace(first, "?").replace(second, first).replace("?", second)
+    rows.write_text(f"{mixed}\n{rest}")
+    code, _, err = cli("verify", model, rows, "--out", tmp_path / "v")
+    assert code == 2 and "new.csv: the usual pose is not where delta has it" in err and said in err, err
+
+
 def test_a_machine_in_a_trackers_frame(tmp_path: Path) -> None:
     """Its base is fitted to the training rows before anything is learned, and is in the model."""
     rows, new = (delta_rows(tmp_path / f"{seed}.csv", seed, moved=True) for seed in (0, 1))

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap
+from ccnn_torch.diagnosis.checks.mistakes import OF_FRAME, mistake
+from ccnn_torch.diagnosis.residual.distance import USUAL, distance, size_of
 from ccnn_torch.display import count_text
 from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
 from ccnn_torch.effects.columns import inside
@@ -277,6 +279,22 @@ def fit_motion(mechanism: Mechanism, expected: Tensor, measured: Tensor) -> Tens
 _SUSPECT = 0.5
 
 
+def _refuse_mistakes(records: Records, machine: Mechanism) -> None:
+    """Raise InputError where the usual row is far from the nominal machine, and units, signs or columns say why; that
+    the measuring device was moved is told with the results."""
+    if isinstance(machine, Seen) or machine.grouped or len(records.pose_coordinates) != len(machine.pose):
+        return
+    rows = Situation(
+        machine, records.joints, {}, default_gravity(machine), None, completed(machine, records.joints, records.pose)
+    )
+    size = size_of(rows)
+    if float(distance(rows, records.pose, size).nanmedian()) <= USUAL:
+        return
+    said = mistake(rows, records.pose, size)
+    if said and not said.startswith(OF_FRAME):
+        raise InputError(f"{records.path}: the usual pose is not where {machine.name} has it: {said}")
+
+
 def verify_model(
     model: LoadedModel,
     records: Any,
@@ -303,6 +321,7 @@ def verify_model(
     machine, loaded = new_rows(model, records, mechanism, **how)
     if not refit_frames:
         check_rows(loaded, machine)
+        _refuse_mistakes(loaded, machine)
     rows = predict(model, machine, loaded, compensated)
     if refit_frames:
         motions = [fit_motion(rows.mechanism, at, rows.pose) for at in (rows.nominal, rows.predicted)]

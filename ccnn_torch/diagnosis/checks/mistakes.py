@@ -142,6 +142,10 @@ _POSE = ("x", "y", "z", "rx", "ry", "rz")
 _LEFT = 0.1
 
 
+OF_FRAME = "the frame that the pose is given in"
+"""How a mistake begins that a measuring device makes which was moved."""
+
+
 def what_is_wrong(situation: Situation, measured: Tensor, size: Size) -> str:
     """What would make model and rows agree if it were put right, with unknown frames fitted anew; empty for nothing."""
     return (
@@ -209,7 +213,7 @@ def _of_pose(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Situ
         yield words, situation, factors * measured
     shift = torch.where(lengths, torch.nan_to_num((measured - situation.pose).nanmedian(0).values), 0.0)
     far = ", ".join(f"{c.name} by {float(v):.4g} m" for c, v in zip(pose, shift, strict=True) if c.unit == "m")
-    words = f"the frame that the pose is given in seems to be shifted ({far}): give the pose in the model's base frame"
+    words = f"{OF_FRAME} seems to be shifted ({far}): give the pose in the model's base frame"
     yield words, situation, measured - shift
     yield from _orientations(situation, measured)
     for i, one in enumerate(pose):
