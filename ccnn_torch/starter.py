@@ -482,6 +482,10 @@ def _other_lines(found: Recognised, table: Table) -> list[str]:
     lines = [f"# Inputs beside the joints, by their names: {', '.join(inputs)}."] if inputs else []
     if ignored:
         lines.append(f"# Not used: {', '.join(ignored)}. `covariates: [NAME]` makes one an input.")
+    warm = [name for name in ignored if table.units[name] and si_unit_of(table.units[name]) == "K"]
+    if warm and "temperature" not in inputs:
+        meant = _quoted(f"temperature[{table.units[warm[0]]}]")
+        lines.append(f"# columns: {{{_quoted(warm[0])}: {meant}}} makes it the temperature that growth follows.")
     return [_plain(line) for line in lines]
 
 

@@ -192,3 +192,18 @@ def test_a_machine_file_is_written_without_records(tmp_path: Path, cli: Callable
 def test_completion_knows_the_mechanisms() -> None:
     assert set(MECHANISMS) == set(REGISTRY) - {"serial", "framed", "partial", "instrument", "pair", "machine"}
     assert complete_mechanism("del") == ["delta", "delta_linear"]
+
+
+def test_a_thermometer_of_a_strange_name_is_told_how_to_be_used(tmp_path: Path, cli: Cli) -> None:
+    headers = ["q1[deg]", "q2[deg]", "q3[deg]", "x[mm]", "y[mm]", "z[mm]", "Fühler am Bett [degC]"]
+    warm = np.linspace(20, 30, 40)[:, None]
+    records = write(tmp_path / "rows.csv", headers, np.concatenate([delta(), warm], axis=1))
+    config = tmp_path / "delta.yaml"
+    made = cli("new", records, "--mechanism", "delta", "--out", config)
+    assert made[0] == 0, made
+    text = config.read_text(encoding="utf-8")
+    line = next(one for one in text.splitlines() if "growth follows" in one)
+    # What it says is what works.
+    config.write_text(f"{text}\n{line.removeprefix('# ').partition(' makes')[0]}\n", encoding="utf-8")
+    code, out, err = cli("check", "--config", config)
+    assert code == 0 and "temperature" in out, (out, err)

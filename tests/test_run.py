@@ -298,3 +298,22 @@ def test_shuffled_order_leaves_nothing_to_learn() -> None:
     shuffled = calibrate(short(methods=["constant"], repeats=20, order="shuffled")).results
     ratios = [r["constant"]["ratio_to_floor"]["median"] for r in (raster, shuffled)]
     assert np.allclose(ratios, 1.55, atol=0.15)
+
+
+def test_what_is_stopped_while_rows_are_read_can_be_resumed(tmp_path: Path, cli: Cli) -> None:
+    def stopped(config: RunConfig) -> Any:
+        raise KeyboardInterrupt
+
+    def wrong(config: RunConfig) -> Any:
+        raise InputError("no such rows")
+
+    config = RunConfig.from_file(TRIPOD, [f"out={tmp_path / 'run'}", "methods=constant", "save_report=false"])
+    with pytest.raises(InputError):
+        replace(RUN, prepare=wrong).start(config, quiet=True)
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(KeyboardInterrupt):
+        replace(RUN, prepare=stopped).start(config, quiet=True)
+    assert cli("run", "--resume", tmp_path / "run", "--quiet")[0] == 0
+    assert (tmp_path / "run" / "results.json").is_file()
+    code, out, _ = cli("run", "--resume", tmp_path / "run")
+    assert code == 0 and "is finished; nothing to do" in out

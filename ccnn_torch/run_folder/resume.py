@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 from ccnn_torch.errors import InputError, WriteError
-from ccnn_torch.report.screen import note
+from ccnn_torch.report.screen import say_place
 from ccnn_torch.run_folder.folder import LOCK, RunFolder
 from ccnn_torch.training import load_checkpoint
 from ccnn_torch.version import __version__
@@ -66,10 +66,10 @@ class FolderJob(Generic[_Config, _Data]):
         """
         # A folder that is taken is refused before records are read, which may take a minute.
         with RunFolder.fresh(config.out, config.name, f"{self.command} --resume") as folder:
-            data = self.prepare(config)
+            # First of all, so that what is stopped while rows are read and effects are weighed can be resumed.
             folder.write("config.yaml", config.to_yaml(folder.path))
             try:
-                self.compute(config, data, folder, quiet, details)
+                self.compute(config, self.prepare(config), folder, quiet, details)
             except WriteError:
                 raise
             except InputError:
@@ -87,7 +87,8 @@ class FolderJob(Generic[_Config, _Data]):
             WriteError: as `start`.
         """
         if (path / self.results).is_file():
-            note(f"{path} is finished; nothing to do", quiet)
+            if not quiet:
+                say_place(f"{path} is finished; nothing to do")
             return RunFolder(path)
         with RunFolder.existing(path, self.command) as folder:
             config = self.model.from_file(folder.config)
