@@ -83,7 +83,8 @@ class WantedPoses:
         first, last = self._mechanism.joints[0], self._mechanism.joints[-1]
         return (
             "An arm reaches a pose on several branches (elbow, wrist): these are the joints nearest to those of the "
-            "previous row, in the first row to what was measured, and may be on another branch than intended; give "
+            "previous row, in the first row and after a jump to what was measured, and may be on another branch than "
+            "intended; give "
             f"guess_{first.header} to "
             f"guess_{last.header} near the joints wanted."
         )
@@ -119,7 +120,7 @@ class WantedPoses:
         self.chooses = bool(mechanism.orientations) and not guided
         if self.chooses:
             before = nearest_measured(mechanism, self._region, poses[0]) if self._before is None else self._before
-            joints = follow(mechanism, poses, before, within)
+            joints = follow(mechanism, poses, before, within, self._region)
             self._before = joints[-1]
         else:
             joints = mechanism.solve_inverse(poses, guess=guess)

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 # Initial guesses solved at once where that of the previous row does not converge.
 _STARTS = 64
+# Of a region, how far beyond its ends still counts as in it.
+_ROOM = 0.05
+# A larger step of a joint from one row to the next is no path's [rad, m].
+_JUMP = 0.5
 EXACT = (1e-8, 1e-8)
 """Largest pose error at joints that were computed [m, rad]."""
 ROUNDED = (1e-4, 1e-3)
@@ -45,23 +49,46 @@ def arrives(mechanism: Mechanism, joints: Tensor, poses: Tensor, within: tuple[f
     return there if error.rotation is None else there & (error.rotation < within[1])
 
 
-def follow(mechanism: Mechanism, poses: Tensor, guess: Tensor, within: tuple[float, float] = EXACT) -> Tensor:
+def follow(
+    mechanism: Mechanism,
+    poses: Tensor,
+    guess: Tensor,
+    within: tuple[float, float] = EXACT,
+    region: Tensor | None = None,
+) -> Tensor:
     """Joints of successive poses `s x p`, each on the branch of the previous row, the first on that of `guess`.
 
-    Where that branch has no solution, take the one nearest to the previous row, out of many initial guesses.
+    Where that branch has no solution, take the one nearest to the previous row, out of many initial guesses; where it
+    leaves a region, lowest and highest joints `n x 2`, by a jump that no path makes, the one nearest within it.
     """
     starts = mechanism.sample_joints(_STARTS, torch.Generator().manual_seed(0))
+
+    def nearest(pose: Tensor, starts: Tensor, inside: Tensor | None = None) -> tuple[Tensor, bool]:
+        found = mechanism.solve_inverse(pose.expand(_STARTS, -1), guess=starts)
+        good = arrives(mechanism, found, pose.expand(_STARTS, -1), within)
+        good = good if inside is None else good & _is_within(mechanism, found, inside)
+        distance = mechanism.wrap(found - guess).norm(dim=-1)
+        return found[torch.where(good, distance, torch.inf).argmin()], bool(good.any())
+
     rows = []
     for pose in poses:
         joints = mechanism.solve_inverse(pose, guess=guess)
         if not bool(arrives(mechanism, joints, pose, within)):
-            found = mechanism.solve_inverse(pose.expand(_STARTS, -1), guess=starts)
-            distance = mechanism.wrap(found - guess).norm(dim=-1)
-            good = arrives(mechanism, found, pose.expand(_STARTS, -1), within)
-            joints = found[torch.where(good, distance, torch.inf).argmin()]
+            joints, _ = nearest(pose, starts)
+        jumped = float(mechanism.wrap(joints - guess).abs().max()) > _JUMP
+        if region is not None and jumped and not bool(_is_within(mechanism, joints, region)):
+            spread = (starts - starts.amin(0)) / (starts.amax(0) - starts.amin(0)).clamp_min(1e-12)
+            other, good = nearest(pose, region[:, 0] + (region[:, 1] - region[:, 0]) * spread, region)
+            joints = other if good else joints
         rows.append(joints)
         guess = torch.where(arrives(mechanism, joints, pose, within), joints, guess)
     return torch.stack(rows)
+
+
+def _is_within(mechanism: Mechanism, joints: Tensor, region: Tensor) -> Tensor:
+    """Whether joints `... x n`, in any turn, are in a region, lowest and highest `n x 2`, or close to it, `...`."""
+    middle, half = region.mean(-1), (0.5 + _ROOM) * (region[:, 1] - region[:, 0])
+    return (mechanism.wrap(joints - middle).abs() <= half).all(-1)
 
 
 def commanded_joints(mechanism: Mechanism, poses: Tensor, guess: Tensor | None) -> Tensor:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from fitted import LIMITS, six_axis_arm
+from torch import Tensor
 
 from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.compensation import load_compensation
@@ -171,3 +172,24 @@ def test_the_first_pose_is_reached_on_the_branch_that_was_measured(tmp_path: Pat
         write_table(tmp_path / "pose.csv", {c.header: pose[i : i + 1].numpy() for i, c in enumerate(arm.pose)})
         found, _ = WantedPoses(model).joints(read_table(tmp_path / "pose.csv"))
         assert float(arm.wrap(torch.from_numpy(found[0]) - joints[row]).abs().max()) < 1e-6
+
+
+def test_after_a_jump_the_branch_is_that_of_what_was_measured(tmp_path: Path) -> None:
+    """Where the solver goes from a row far away is anywhere; a path that leaves what was measured is followed."""
+    arm, none = six_axis_arm(), torch.zeros(0, 2, dtype=torch.float64)
+    about = (default_gravity(arm), torch.tensor(LIMITS, dtype=torch.float64), (), none, {}, {})
+    model = model_of_machine(tmp_path / "diagnosis.json", FoundMachine(arm, arm.nominal, [], *about))
+    low, high = torch.from_numpy(model.region).unbind(-1)
+    middle, room = (low + high) / 2, 0.55 * (high - low)
+
+    def inside(wanted: Tensor) -> Tensor:
+        pose = arm.forward_kinematics(wanted)
+        write_table(tmp_path / "pose.csv", {c.header: pose[:, i].numpy() for i, c in enumerate(arm.pose)})
+        found = torch.from_numpy(WantedPoses(model).joints(read_table(tmp_path / "pose.csv"))[0])
+        torch.testing.assert_close(arm.forward_kinematics(found)[:, :3], pose[:, :3], rtol=0, atol=1e-7)
+        return (arm.wrap(found - middle).abs() <= room).all(-1)
+
+    jumping = arm.sample_joints(30, torch.Generator().manual_seed(4))
+    assert bool(inside(jumping).all())
+    path = middle + torch.linspace(0, 1, 25, dtype=torch.float64)[:, None] * (high - low) * torch.eye(6)[0].double()
+    assert inside(path).tolist() == (arm.wrap(path - middle).abs() <= room).all(-1).tolist()
