@@ -84,9 +84,7 @@ class WantedPoses:
         return (
             "An arm reaches a pose on several branches (elbow, wrist): these are the joints nearest to those of the "
             "previous row, in the first row and after a jump to what was measured, and may be on another branch than "
-            "intended; give "
-            f"guess_{first.header} to "
-            f"guess_{last.header} near the joints wanted."
+            f"intended; give guess_{first.header} to guess_{last.header} near the joints wanted."
         )
 
     def joints(self, table: Table, shown: JointMap | None = None) -> tuple[NDArray[np.float64], dict[str, str]]:

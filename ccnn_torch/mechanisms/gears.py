@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.spelling import hint
 
@@ -59,19 +60,22 @@ def read_motors(told: Any, joints: Sequence[Coordinate], where: str) -> Motors:
     """
     form, names = f"{where} must be as {{q5: {{q4: 0.667}}}}", [joint.name for joint in joints]
     if not isinstance(told, Mapping) or not all(isinstance(row, Mapping) for row in told.values()):
-        raise InputError(f"{form}: of a motor, by its joint, what other joints turn it, got {told!r}")
+        raise InputError(f"{form}: of a motor, by its joint, what other joints turn it, got {visible(repr(told))}")
     found = np.eye(len(joints))
     for motor, row in told.items():
         for name in (motor, *row):
             if name not in names:
-                raise InputError(f"{where}: '{name}' is no joint of the machine; {hint(str(name), names, 'they are')}")
+                near = hint(str(name), names, "they are")
+                raise InputError(f"{where}: '{visible(str(name))}' is no joint of the machine; {near}")
         to = names.index(motor)
         for name, value in row.items():
             by = names.index(name)
             if joints[by].unit != joints[to].unit:
                 raise InputError(f"{where}: {name} is in {joints[by].unit}, and {motor} in {joints[to].unit}")
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _MOST:
-                raise InputError(f"{where}: {motor}: {name}: must be a number of turns a turn, got {value!r}")
+                raise InputError(
+                    f"{where}: {motor}: {name}: must be a number of turns a turn, got {visible(repr(value))}"
+                )
             found[to, by] = value
     if np.linalg.cond(found) > _CONDITION:
         raise InputError(f"{where}: the joints do not follow from these motors; give every motor its own joint")
