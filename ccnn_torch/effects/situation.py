@@ -467,14 +467,15 @@ class Situation:
 
 
 def where_moved(nominal: Tensor, shown: Tensor) -> Tensor:
-    """Nominal coordinates, but those that were shown where these vary far less over the rows, `... x s x c`.
+    """Nominal coordinates, but the middle of those that were shown where these vary far less over the rows,
+    `... x s x c`.
 
-    A machine that is led to the same few points is there: its nominal coordinates then vary by nothing but the gap, and
-    any cause that goes by them would explain it.
+    A machine that is led to one height, as that of a bed, is there: its nominal coordinate then varies by nothing but
+    the gap, and what was shown by the noise, and any cause that goes by them would explain it.
     """
     shown = torch.where(torch.isfinite(shown), shown, nominal)
     spread, other = (values.amax(-2, keepdim=True) - values.amin(-2, keepdim=True) for values in (nominal, shown))
-    return torch.where(other < _FAR_LESS * spread, shown, nominal)
+    return torch.where(other < _FAR_LESS * spread, shown.mean(-2, keepdim=True), nominal)
 
 
 def _known(values: Tensor) -> Tensor:

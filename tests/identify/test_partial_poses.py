@@ -11,11 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from ccnn_torch import diagnose
 from ccnn_torch.api import identify
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.poses import compares_poses
 from ccnn_torch.mechanisms import Mechanism, Partial, load_mechanism
-from ccnn_torch.records import write_table
+from ccnn_torch.records import load_records, write_table
 
 KEYS: dict[str, Any] = {"base": 0.18, "platform": 0.05, "rod": 0.25}
 NOISE = 5e-6
@@ -61,6 +62,21 @@ def test_heights_of_a_bed_alone_make_it_flat_where_no_probe_was(tmp_path: Path) 
     assert float(before.std()) > 3e-5
     # Twenty-one numbers from 140 rows.
     assert float(after.square().mean().sqrt()) < 0.7 * NOISE
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_wrong_lengths_are_found_in_the_heights_of_a_bed(tmp_path: Path, seed: int) -> None:
+    """All rows are at one height: that which was measured is their noise, and nothing that an error could follow."""
+    nominal, truth = _printer()
+    joints = nominal.solve_inverse(_bed(60, 10 + seed), truth)
+    noise = NOISE * torch.randn(60, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    columns = {f"q{k + 1}[m]": joints[:, k].numpy() for k in range(3)}
+    write_table(tmp_path / "bed.csv", columns | {"z[m]": noise.numpy()})
+    said = diagnose(
+        load_records(tmp_path / "bed.csv", nominal), nominal, effects=["geometry", "joint_offset", "gravity"]
+    )
+    assert said.verdict["effects"] == ["geometry"] and not said.verdict["outside_library"], said.verdict
+    assert said.verdict["probability"] > 0.9 and said.verdict["shrink"] > 0.99
 
 
 def test_commands_of_a_verdict_about_heights_alone_go_to_x_and_y_as_well(
