@@ -172,6 +172,24 @@ def test_a_tracker_that_was_moved(model: Path, tmp_path: Path) -> None:
     assert found["position"]["after"]["rms"] == pytest.approx(3**0.5 * NOISE, rel=0.2)
 
 
+def test_a_row_where_the_way_back_is_damped_is_not_judged(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = delta_rows(tmp_path / "new.csv", seed=1)
+    whole, found = ccnn_torch.verify(model, rows), ccnn_torch.verification.job._found
+
+    def damped(*given: object) -> dict[str, np.ndarray]:
+        told = {name: np.array(value) for name, value in found(*given).items()}
+        told["ideal_status"][3], told["ideal"][3] = 3, told["ideal"][3] + 0.02
+        return told
+
+    monkeypatch.setattr(ccnn_torch.verification.job, "_found", damped)
+    held = ccnn_torch.verify(model, rows)
+    assert any(note.startswith("1 row next to a singular pose") for note in held["notes"])
+    assert held["position"]["after"]["rms"] == pytest.approx(whole["position"]["after"]["rms"], rel=0.02)
+    assert held["rows"] == whole["rows"] and not any("singular" in note for note in whole["notes"])
+
+
 @pytest.mark.parametrize(("swapped", "said"), [(("x[m]", "y[m]"), "x and y"), (("q1[rad]", "q3[rad]"), "q1 and q3")])
 def test_rows_with_swapped_columns_are_refused(
     model: Path, tmp_path: Path, cli: Cli, swapped: tuple[str, str], said: str

@@ -14,6 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from ccnn_torch.compensation import LoadedModel
+from ccnn_torch.compensation.outputs import DAMPED
 from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap
 from ccnn_torch.diagnosis.checks.mistakes import OF_FRAME, mistake
 from ccnn_torch.diagnosis.residual.distance import USUAL, distance, size_of
@@ -52,7 +53,8 @@ _RUN_WEIGHT, _ARM_DAMPING = 0.04, 0.01
 
 @dataclass(frozen=True)
 class Rows:
-    """Records and predictions of a model: joints and deviations `s x n`, poses `s x p` [SI]; inside `s`, bool."""
+    """Records and predictions of a model: joints and deviations `s x n`, poses `s x p` [SI]; inside `s`, bool; damped
+    `s`, bool: what the model predicts is not where its machine would be, but what it holds back to."""
 
     mechanism: Mechanism
     joints: Tensor
@@ -61,6 +63,7 @@ class Rows:
     inside: Tensor
     nominal: Tensor
     predicted: Tensor
+    damped: Tensor
 
     @property
     def whole(self) -> Tensor:
@@ -184,7 +187,9 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
         )
     key = "inside_domain" if compensated else "ideal_inside_domain"
     inside = torch.from_numpy(np.all([one[key] for one in found], axis=0))
-    return Rows(machine, records.joints, pose, ideal[0] - records.joints, inside, nominal, predicted)
+    back = model.machine is None and not compensated
+    damped = torch.from_numpy(np.any([back & (one["ideal_status"] == DAMPED) for one in found], axis=0))
+    return Rows(machine, records.joints, pose, ideal[0] - records.joints, inside, nominal, predicted, damped)
 
 
 def _covariates(model: LoadedModel, records: Records) -> dict[str, Tensor]:
@@ -236,6 +241,14 @@ def gaps(rows: Rows, compensated: bool, motions: list[Tensor]) -> tuple[Tensor, 
     first, last = (machine.frame(rows.undone(motion))[0] for motion in motions)
     before, after = (predicted - nominal, first - nominal) if compensated else (first - nominal, last - predicted)
     return first, before, after
+
+
+def _of(error: PoseError, judged: Tensor) -> PoseError:
+    """Errors `s`, NaN in rows that are not judged, `s` bool."""
+    parts = (None if part is None else torch.where(judged, part, torch.nan) for part in error)
+    position, rotation = parts
+    assert position is not None
+    return PoseError(position, rotation)
 
 
 # Rows that show a frame.
@@ -328,6 +341,8 @@ def verify_model(
     else:
         motions = [torch.zeros(6, dtype=torch.float64)] * 2
     before, after, measured, left, usable = judge(rows, compensated, motions, pseudoerror_settings(model, machine))
+    judged = ~rows.damped if bool((~rows.damped).any()) else torch.ones_like(rows.damped)
+    before, after, usable = _of(before, judged), _of(after, judged), usable & judged
     groups = configurations(rows.joints, machine.joints)
     promise = promise_of(model)
     count = int(groups.max()) + 1
@@ -365,6 +380,11 @@ def verify_model(
         first, last = (getattr(error, results.kinds[0]) for error in (before, after))
         results.kept = paired_gain(first, last, groups)
     results.notes += loaded.missing
+    if held := int((~judged).sum()):
+        results.notes.append(
+            f"{count_text(held, 'row')} next to a singular pose, where the model holds its way back to the nearest "
+            "safe joints, so that it predicts no pose there: not judged."
+        )
     if results.outside_domain:
         results.notes.append(
             f"{count_text(results.outside_domain, 'row')} outside the model's domain, where its correction fades: "
