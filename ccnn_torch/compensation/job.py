@@ -156,9 +156,10 @@ def write_compensated(
             result.beyond |= loaded.beyond(at[out], None if covariates is None else covariates[out])
         if poses is not None and poses.lost:
             hint = f", or give guess_{loaded.joints[0].header}… near the solution" if poses.chooses else ""
+            others = f"{output} has the other {result.rows} rows" if result.rows else f"{output} is not written"
             result.lost = (
                 f"{input}: no joints of {loaded.facts['mechanism']['name']} were found for the pose at {poses.lost}; "
-                f"{output} has the other {result.rows} rows: correct these poses{hint}"
+                f"{others}: correct these poses{hint}"
             )
             if not result.rows:
                 # Then nothing is written.

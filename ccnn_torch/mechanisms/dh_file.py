@@ -331,10 +331,11 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
         _check_one_piece(path, known, joints)
     if tip is None:
         tips = [link for link in known if link in parent_joint and link not in parents]
+        if not tips:
+            wrong = "its joints form a loop; a chain has an end" if joints else "has no joint from one link to another"
+            raise InputError(f"{path}: {wrong}")
         if len(tips) != 1:
-            raise InputError(
-                f"{path}: the chain branches; give the last link as tip=, one of {', '.join(tips) or 'none'}"
-            )
+            raise InputError(f"{path}: the chain branches; give the last link as tip=, one of {', '.join(tips)}")
         tip = tips[0]
     chain: list[Element] = []
     link = tip
