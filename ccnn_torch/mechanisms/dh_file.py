@@ -332,8 +332,7 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
     if tip is None:
         tips = [link for link in known if link in parent_joint and link not in parents]
         if not tips:
-            wrong = "its joints form a loop; a chain has an end" if joints else "has no joint from one link to another"
-            raise InputError(f"{path}: {wrong}")
+            raise InputError(f"{path}: has no joint at the end of a chain; it needs those from link to link")
         if len(tips) != 1:
             raise InputError(f"{path}: the chain branches; give the last link as tip=, one of {', '.join(tips)}")
         tip = tips[0]

@@ -149,20 +149,9 @@ def test_a_joint_that_a_urdf_lacks_is_missed(tmp_path, tip):
         read_urdf(str(path), tip=tip)
 
 
-@pytest.mark.parametrize(
-    ("inside", "said"),
-    [
-        ("", "has no joint from one link to another"),
-        (
-            '<link name="b"/><joint name="j" type="revolute"><parent link="a"/><child link="b"/></joint>'
-            '<joint name="k" type="revolute"><parent link="b"/><child link="a"/></joint>',
-            "its joints form a loop",
-        ),
-    ],
-)
-def test_a_urdf_without_an_end_is_named(tmp_path, inside, said):
-    (tmp_path / "arm.urdf").write_text(f'<robot name="x"><link name="a"/>{inside}</robot>')
-    with pytest.raises(InputError, match=said):
+def test_a_urdf_without_joints_is_named(tmp_path):
+    (tmp_path / "arm.urdf").write_text('<robot name="x"><link name="a"/></robot>')
+    with pytest.raises(InputError, match="has no joint at the end of a chain"):
         load_mechanism(str(tmp_path / "arm.urdf"))
 
 
