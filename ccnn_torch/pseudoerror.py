@@ -55,7 +55,8 @@ class Pseudoerror:
             rows = torch.nonzero(flagged.reshape(-1, flagged.shape[-1]).any(0)).squeeze(-1)
             if len(rows):
                 named = ", ".join(str(int(i) + 1) for i in rows[:max_named]) + (", …" if len(rows) > max_named else "")
-                found.append(f"{len(rows)} rows are not trained on: {sentences[reason]} (rows {named})")
+                which, are = ("rows", "are") if len(rows) > 1 else ("row", "is")
+                found.append(f"{len(rows)} {which} {are} not trained on: {sentences[reason]} ({which} {named})")
         return found
 
 

@@ -240,5 +240,8 @@ def test_thousands_and_a_row_that_breaks_off_are_told_as_such(tmp_path: Path) ->
     path = tmp_path / "r.csv"
     path.write_text("q1[mm],q2[deg],y[mm],phi[rad]\n" + '"1,234.5",0.2,0.3,0.4\n' * 9)
     refused(path, "write numbers without thousands separators")
+    # Commas that are decimal ones beside numbers with points, and quoted where they stand between cells as well.
+    path.write_text('"q1[rad]","x[m]"\n"0,8","1.5"\n"0.7","1.4"\n')
+    refused(path, "write its decimal comma as a point (0.8)")
     path.write_text("q1[mm],q2[deg],y[mm],phi[rad]\n" + "0.1,0.2,0.3,0.4\n" * 9 + "0.1,0.")
     assert "semicolons" not in refused(path, "has 2 cells")

@@ -24,6 +24,8 @@ FILE = "file"
 """The column that numbers the files where there are several: 0, 1, …"""
 # A number with thousands separators: two of them, or one and another mark before the decimals.
 _GROUPED = re.compile(r"-?\d{1,3}(?:([., ])\d{3}(?:\1\d{3})+(?:[.,]\d*)?|([., ])\d{3}(?!\2)[.,]\d+)")
+# A number with a decimal comma, in a file whose commas are between cells or whose other numbers have points.
+_COMMA = re.compile(r"[+-]?\d+,\d+")
 PAYLOAD = "payload"
 """A column that is read as a load where it has a mass, and no other column has a load."""
 
@@ -140,6 +142,11 @@ class Table:
             remedy = "write a finite number or remove the row"
             if _GROUPED.fullmatch(text):
                 remedy = "write numbers without thousands separators"
+            elif _COMMA.fullmatch(text):
+                point = text.replace(",", ".")
+                remedy = (
+                    f"write its decimal comma as a point ({point}), or all numbers with a comma and ; between cells"
+                )
             raise InputError(f"{self.path}: column '{name}' {what} at {self.name_rows([row])}{more}; {remedy}")
         converted = to_si(values, unit or "1", si_unit, f"{self.path}: column '{name}'", name)
         far = np.flatnonzero(np.abs(converted) > LARGEST)

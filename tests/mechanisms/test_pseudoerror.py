@@ -81,7 +81,7 @@ def test_singular_rows_are_flagged_and_named(tmp_path):
     assert found.reasons["condition"].tolist() == [False, True, False]
     assert float(found.deviation[1].abs().max()) > 10 * float(found.deviation[0].abs().max())
     (note,) = found.notes()
-    assert note.startswith("1 rows are not trained on: the arm is near a singularity") and note.endswith("(rows 2)")
+    assert note.startswith("1 row is not trained on: the arm is near a singularity") and note.endswith("(row 2)")
     bound = joint_deviations(arm, commanded, measured, max_condition=1e9, max_deviation=0.02)
     assert bound.reasons["deviation"].tolist() == [False, True, False]
     damped = joint_deviations(arm, commanded, measured, max_condition=1e9, damping=0.01)

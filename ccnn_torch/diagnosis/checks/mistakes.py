@@ -133,6 +133,7 @@ _LENGTHS = {
     "centimetres under m": 1e-2,
     "inches under m": 0.0254,
     "inches under mm": 25.4,
+    "millimetres under inches": 1 / 25.4,
     "metres under mm, or the model in millimetres under m": 1e3,
 }
 _ANGLES = {"degrees under rad": 1 / _TURN, "radians under deg": _TURN}
