@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from ccnn_torch.records.table import PAYLOAD, Table
 from ccnn_torch.spelling import matching
 from ccnn_torch.units import si_unit_of, to_si
 
+_quoted = partial(json.dumps, ensure_ascii=False)
 _JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta|leg)0*(\d+)")
 # As drivers write them: actual_q_0, arm_1_joint, left_joint3.
 _OTHER_JOINT = re.compile(
@@ -293,7 +294,7 @@ def starter_config(
     lines = [
         _plain(f"# Written by `ccnn new` for {records.name}, {len(table)} rows: check what it guessed."),
         "# `ccnn keys` lists every key.",
-        f"records: {json.dumps(_relative(records, out), ensure_ascii=False)}",
+        f"records: {_quoted(_relative(records, out))}",
         *_mechanism_lines(name, why, out),
         *_column_lines(columns, found, table, why_turned),
         *(["# No joints: they are the nominal inverse kinematics of the commanded pose."] if found.goals else []),
@@ -319,11 +320,11 @@ def _motion_config(records: Path, out: Path, mechanism: str | None, keys: Mappin
     servo = "each joint follows its command; keys of the drives, or an MJCF of the arm: docs/how_to/motion.md"
     lines = [
         _plain(
-            f"# Written by `ccnn new` for {records.name}, {count_text(len(logs), 'run')} of {samples} samples in all."
+            f"# Written by `ccnn new` for {records.name}, {count_text(len(logs), 'run')}, {samples} samples in all."
         ),
         *(_plain(f"# {note.removeprefix(f'{records}: ')}.") for note in notes),
-        f"motion: {json.dumps(_relative(records, out), ensure_ascii=False)}",
-        *([f"motion_keys: {json.dumps(dict(keys), ensure_ascii=False)}"] if keys else []),
+        f"motion: {_quoted(_relative(records, out))}",
+        *([f"motion_keys: {_quoted(dict(keys))}"] if keys else []),
         *(_mechanism_lines(mechanism, "given", out) if mechanism else [f"mechanism: servo   # {servo}"]),
     ]
     return "\n".join(lines) + "\n", True
@@ -416,7 +417,7 @@ def _mechanism_lines(name: str | None, why: str, out: Path) -> list[str]:
         file, colon, of = name.rpartition(":") if is_plugin(name) else (name, "", "")
         path = _relative(Path(file), out) + colon + of if Path(file).is_file() else name
         keys = ["mechanism_keys: {allow_code: true}   # it is Python code"] if colon else _dimension_lines(name)
-        return [f"mechanism: {json.dumps(path, ensure_ascii=False)}   # {why}", *keys]
+        return [f"mechanism: {_quoted(path)}   # {why}", *keys]
     fitting = f" ({why} would fit)" if why else ""
     return [
         f"# FILL IN the machine{fitting}: a built-in name, or an arm's geometry as a DH file (.yaml) or URDF;",
@@ -448,7 +449,7 @@ def _column_lines(columns: dict[str, str], found: Recognised, table: Table, why:
         ]
     if not needed and not bare:
         return lines
-    entries = [f"  {_quoted(header)}: {json.dumps(target, ensure_ascii=False)}" for header, target in needed.items()]
+    entries = [f"  {_quoted(header)}: {_quoted(target)}" for header, target in needed.items()]
     entries += [f'  {_quoted(n)}: ignore   # no unit: write "{n}[unit]" to have it as an input' for n in bare]
     return [*lines, "columns:", *entries]
 
@@ -475,22 +476,18 @@ def _count_lines(
 
 
 def _other_lines(found: Recognised, table: Table) -> list[str]:
-    told = [target.partition("[")[0] for target in found.inputs.values()]
-    inputs = [name for name in matching(found.unknown, DEFAULT_COVARIATES) if table.units[name]] + told
-    read = {*DEFAULT_COVARIATES, *([PAYLOAD] if "load_z" in inputs else [])}
-    ignored = [name for name in found.unknown if not matching([name], [*read])]
+    inputs = [name for name in matching(found.unknown, DEFAULT_COVARIATES) if table.units[name]]
+    inputs += [target.partition("[")[0] for target in found.inputs.values()]
+    read = [*DEFAULT_COVARIATES, *([PAYLOAD] if "load_z" in inputs else [])]
+    ignored = [name for name in found.unknown if not matching([name], read)]
     lines = [f"# Inputs beside the joints, by their names: {', '.join(inputs)}."] if inputs else []
     if ignored:
         lines.append(f"# Not used: {', '.join(ignored)}. `covariates: [NAME]` makes one an input.")
     warm = [name for name in ignored if table.units[name] and si_unit_of(table.units[name]) == "K"]
-    if warm and "temperature" not in inputs:
-        meant = _quoted(f"temperature[{table.units[warm[0]]}]")
-        lines.append(f"# columns: {{{_quoted(warm[0])}: {meant}}} makes it the temperature that growth follows.")
+    for name in warm[: "temperature" not in inputs]:
+        meant = _quoted(f"temperature[{table.units[name]}]")
+        lines.append(f"# columns: {{{_quoted(name)}: {meant}}} makes it the temperature that growth follows.")
     return [_plain(line) for line in lines]
-
-
-def _quoted(header: str) -> str:
-    return json.dumps(header, ensure_ascii=False)
 
 
 def _plain(line: str) -> str:
@@ -501,4 +498,4 @@ def _plain(line: str) -> str:
 def _relative(path: Path, out: Path) -> str:
     """From the config's folder where the file is below it, else the whole path."""
     folder, file = out.absolute().parent, path.absolute()
-    return os.path.relpath(file, folder) if file.is_relative_to(folder) else str(file)
+    return str(file.relative_to(folder) if file.is_relative_to(folder) else file)

@@ -13,6 +13,7 @@ from ccnn_torch.effects.columns import inside
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, REFERENCE, Situation, load_columns
 from ccnn_torch.effects.time import ROW
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms.gears import turns_of
 
 SHIFT = 8 * 3600.0
 """Rows are spread evenly over a shift [s]."""
@@ -58,7 +59,7 @@ def draw_covariates(
         draw = torch.randn(rows, generator=generator, dtype=torch.float64)
         found[f"load_{coordinate.name}"] = sizes[coordinate.unit] * draw
     before = torch.where(torch.rand(1, n, generator=generator, dtype=torch.float64) < 0.5, -1.0, 1.0)
-    found |= directions(joints, before)
+    found |= directions(mechanism, joints, before)
     for condition in mechanism.takes:
         if condition.name not in found and condition.spread > 0:
             draw = torch.randn(rows, generator=generator, dtype=torch.float64)
@@ -66,9 +67,10 @@ def draw_covariates(
     return found
 
 
-def directions(joints: Tensor, before: Tensor) -> dict[str, Tensor]:
-    """`direction1`…, `s` each: signs of the ways between rows of joints `s x n`, and `before` of the first, `1 x n`."""
-    way = torch.where(joints.diff(dim=0) < 0, -1.0, 1.0)
+def directions(mechanism: Mechanism, joints: Tensor, before: Tensor) -> dict[str, Tensor]:
+    """`direction1`…, `s` each: signs of the motors' ways between rows of joints `s x n`, and `before` of the first,
+    `1 x n`."""
+    way = torch.where(turns_of(mechanism.motors, joints).diff(dim=0) < 0, -1.0, 1.0)
     signs = torch.cat([before, way])[: len(joints)]
     return {f"direction{i + 1}": sign for i, sign in enumerate(signs.unbind(-1))}
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import force_of, is_temperature
 from ccnn_torch.mechanisms import Instrument, Mechanism, Seen, SerialArm, sees_directions
+from ccnn_torch.mechanisms.gears import turns_of
 from ccnn_torch.mechanisms.machines.serial import FRAME
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records.commanded import SECOND
@@ -267,31 +268,30 @@ class Situation:
         return self.joints - self.middle
 
     @cached_property
-    def _motors(self) -> tuple[Tensor, Tensor] | None:
-        """Turns of the motors by those of the joints, `n x n`, and its inverse; None where each joint has its own."""
+    def _by_motors(self) -> Tensor | None:
+        """Turns of the joints by those of the motors, `n x n`; None where each joint has its own."""
         if not self.mechanism.motors:
             return None
         # By numpy: a graph that is traced has no inverse of a constant.
-        turns = np.array(self.mechanism.motors)
-        return torch.tensor(turns, dtype=self.joints.dtype), torch.tensor(np.linalg.inv(turns), dtype=self.joints.dtype)
+        return torch.tensor(np.linalg.inv(np.array(self.mechanism.motors)), dtype=self.joints.dtype)
 
     @cached_property
     def motor_turns(self) -> Tensor:
         """How far the motor of each joint has turned, over its gear, at the commanded joints, `... x s x n`."""
-        return self.joints if self._motors is None else self.joints @ self._motors[0].mT
+        return turns_of(self.mechanism.motors, self.joints)
 
     @cached_property
     def motor_jacobian(self) -> Tensor:
         """Derivative of position and rotation vector by the motors' turns, `... x s x c x n`; NaN without pose."""
-        return self.jacobian if self._motors is None else self.jacobian @ self._motors[1]
+        return self.jacobian if self._by_motors is None else self.jacobian @ self._by_motors
 
     def joints_by(self, motors: Tensor) -> Tensor:
         """What changes of the motors `... x n x m` change of the joints, `... x n x m`."""
-        return motors if self._motors is None else self._motors[1] @ motors
+        return motors if self._by_motors is None else self._by_motors @ motors
 
     def _on_motors(self, torque: Tensor) -> Tensor:
         """What torques on the joints `... x n` are on the motors, over their gears, by virtual work, `... x n`."""
-        return torque if self._motors is None else torque @ self._motors[1]
+        return torque if self._by_motors is None else torque @ self._by_motors
 
     def once(self, make: Callable[[Situation], Tensor]) -> Tensor:
         """What a function makes of these rows, kept with them from when it is first asked for."""

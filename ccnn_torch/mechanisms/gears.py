@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.display import visible
@@ -90,3 +92,8 @@ def moved_by(motors: Motors) -> list[tuple[int, int]]:
     others = (turns != 0) & ~np.eye(len(turns), dtype=bool)
     moved = np.abs(np.linalg.inv(turns)) @ others > _NONE
     return [(int(i) + 1, int(j) + 1) for i, j in np.argwhere(moved) if i != j]
+
+
+def turns_of(motors: Motors, joints: Tensor) -> Tensor:
+    """How far each motor has turned, over its gear, at joints `... x n`, `... x n`."""
+    return joints @ torch.tensor(motors, dtype=joints.dtype).mT if motors else joints

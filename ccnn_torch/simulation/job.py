@@ -219,7 +219,7 @@ def simulate_records(
         # At the edge of what the nominal machine reaches: the changed one gets others in the place of these.
         joints = torch.where(lost[:, None], draw_poses(machine, rows, config, generator)[0], joints)
         first = torch.stack([columns[f"direction{i + 1}"][:1] for i in range(joints.shape[-1])], -1)
-        columns |= directions(joints, first)
+        columns |= directions(machine, joints, first)
         situation = _situation(machine, joints, columns, config, Sag.name in names)
         frame = reached(situation, acting)
         lost = ~torch.isfinite(frame).all(-1)

@@ -345,7 +345,7 @@ def verify_model(
     before, after, usable = _of(before, judged), _of(after, judged), usable & judged
     groups = configurations(rows.joints, machine.joints)
     promise = promise_of(model)
-    count = int(groups.max()) + 1
+    count = len(torch.unique(groups[judged]))
 
     def error(kind: str, unit: Length, first: Tensor | None, last: Tensor | None) -> Error | None:
         return error_of(unit, first, last, promised(promise, kind, count) if promise else None)

@@ -13,7 +13,9 @@ from physical_rows import ARM, acting, columns, situation
 from torch import Tensor
 
 from ccnn_torch import diagnose
+from ccnn_torch.diagnosis.checks import unrecorded
 from ccnn_torch.effects import Situation, default_gravity, make_effect, moved_joints, reached
+from ccnn_torch.effects.covariates import directions
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import SerialArm, load_mechanism, mechanism_from_description
 from ccnn_torch.records import load_records, write_table
@@ -67,6 +69,16 @@ def test_springs_carry_what_the_motors_do_and_work_is_the_same(wrist: str) -> No
     torch.testing.assert_close(there, moved, rtol=1e-3, atol=1e-8)
     sagged = moved_joints(rows, [acting("gravity", rows, q6=1e-4)]).numpy()
     np.testing.assert_allclose(sagged[:, 5], 1e-4 * rows.own_weight_torque[:, 5].numpy(), rtol=1e-9)
+
+
+def test_directions_that_follow_from_the_order_are_those_of_the_motors(wrist: str) -> None:
+    rows = situation(wrist, rows=30)
+    drawn = directions(rows.mechanism, rows.joints, torch.ones(1, 6))
+    for way in (unrecorded._directions(rows, torch.arange(30)), drawn):
+        found = torch.stack([way[f"direction{k}"] for k in range(1, 7)], -1).numpy()[1:]
+        np.testing.assert_array_equal(found, np.sign(np.diff(_of_motors(rows.joints), axis=0)))
+    # Of the joints some are others.
+    assert (np.sign(np.diff(rows.joints.numpy(), axis=0)) != found)[:, 4:].any()
 
 
 def test_without_common_motors_nothing_is_another(wrist: str) -> None:

@@ -176,17 +176,17 @@ def order_shows(analysis: Analysis, judgement: Judgement, columns: Mapping[str, 
 
 
 def _directions(situation: Situation, order: Tensor) -> dict[str, Tensor]:
-    """Sign of each joint's way from the row before in an order of the rows, to the second place from the first.
+    """Sign of each motor's way from the row before in an order of the rows, to the second place from the first.
 
-    A joint that stands still keeps its sign; before its first motion it is 0.
+    One that stands still keeps its sign; before its first motion it is 0.
     """
-    joints = torch.stack([place.joints for place in situation.places], 1)
-    visited = joints[order].flatten(0, 1)
+    turns = torch.stack([place.motor_turns for place in situation.places], 1)
+    visited = turns[order].flatten(0, 1)
     way = visited.diff(dim=0, prepend=visited[:1]).sign()
     rows = torch.arange(len(way))[:, None].expand_as(way)
     last = torch.where(way != 0, rows, 0).cummax(0).values
-    signs = torch.empty_like(joints)
-    signs[order] = way.gather(0, last).reshape(joints.shape)
+    signs = torch.empty_like(turns)
+    signs[order] = way.gather(0, last).reshape(turns.shape)
     return {
         f"direction{i + 1}{ending}": way
         for ending, place in zip(("", SECOND), signs.unbind(1), strict=False)
