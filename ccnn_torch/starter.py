@@ -319,9 +319,7 @@ def _motion_config(records: Path, out: Path, mechanism: str | None, keys: Mappin
     samples, notes = sum(len(log.time) for log in logs), [note for log in logs for note in log.notes]
     servo = "each joint follows its command; keys of the drives, or an MJCF of the arm: docs/how_to/motion.md"
     lines = [
-        _plain(
-            f"# Written by `ccnn new` for {records.name}, {count_text(len(logs), 'run')}, {samples} samples in all."
-        ),
+        _plain(f"# Written by `ccnn new` for {records.name}, {count_text(len(logs), 'run')}, {samples} samples."),
         *(_plain(f"# {note.removeprefix(f'{records}: ')}.") for note in notes),
         f"motion: {_quoted(_relative(records, out))}",
         *([f"motion_keys: {_quoted(dict(keys))}"] if keys else []),
