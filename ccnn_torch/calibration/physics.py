@@ -213,6 +213,7 @@ def fit_physics(
         fit = torch.zeros(len(records.joints), dtype=torch.bool)
         fit[Dataset.part(split, "fit")] = True
         fit &= usable.expand(len(splits), -1)[k]
+        situation = situation.fitted_to(fit)
         fitted, own = fit_jointly(situation, records.pose, known, fit, loose_parameters(mechanism, identify))
         for one in fitted:
             if one.effect.kind == "parameters":

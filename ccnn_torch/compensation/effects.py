@@ -218,6 +218,7 @@ class PhysicalEffects(nn.Module):
         fields: what the effects see of the nominal machine.
         gravity: `3` [m/s²].
         numbers: of every effect by name and coefficient, for the model's card.
+        travel: as of `Situation`.
     """
 
     gravity: Tensor
@@ -230,8 +231,10 @@ class PhysicalEffects(nn.Module):
         acting: Sequence[Acting],
         fields: Fields,
         numbers: Mapping[str, Mapping[str, float]],
+        travel: Tensor | None,
     ) -> None:
         super().__init__()
+        self.travel = travel
         # In a tuple, since the mechanism's own buffers are no part of the model.
         self._mechanism = (mechanism,)
         self.covariates = list(covariates)
@@ -280,7 +283,7 @@ class PhysicalEffects(nn.Module):
         rows = joints.reshape(-1, joints.shape[-1])
         columns = covariates.reshape(-1, covariates.shape[-1]) if self.covariates else covariates
         given = {name: columns[:, i] for i, name in enumerate(self.covariates) if name != "time"}
-        return self.fields.fill(Situation(self._mechanism[0], rows, given, self.gravity))
+        return self.fields.fill(Situation(self._mechanism[0], rows, given, self.gravity, travel=self.travel))
 
     def describe(self) -> dict[str, Any]:
         """Everything `from_description` needs; the tensors are stored beside it."""
@@ -290,6 +293,7 @@ class PhysicalEffects(nn.Module):
             "acting": [[one.effect.name, len(one.shape), len(one.coefficients)] for one in self.acting],
             "fields": self.fields.describe(),
             "numbers": self.numbers,
+            "travel": None if self.travel is None else self.travel.tolist(),
         }
 
     @classmethod
@@ -301,6 +305,8 @@ class PhysicalEffects(nn.Module):
             Acting(make_effect(name), *(torch.zeros(size, dtype=torch.float64) for size in sizes))
             for name, *sizes in description["acting"]
         ]
+        # Files of before have none.
+        travel = description.get("travel")
         return cls(
             mechanism,
             torch.zeros(3, dtype=torch.float64),
@@ -308,6 +314,7 @@ class PhysicalEffects(nn.Module):
             acting,
             Fields.from_description(description["fields"], mechanism),
             description["numbers"],
+            None if travel is None else torch.tensor(travel, dtype=torch.float64).reshape(2, len(mechanism.joints)),
         )
 
 
@@ -339,7 +346,7 @@ def expand_effects(
         named = [c.name for c in one.effect.coefficients(situation)] + [s.name for s in one.effect.shapes(situation)]
         values = [*one.coefficients.tolist(), *one.shape.tolist()]
         numbers[label] = dict(zip(named, values, strict=True))
-    module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, numbers)
+    module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, numbers, situation.travel)
     module.requires_grad_(False)
     # Effects that ask which of their columns the workspace shows keep the answer; a traced graph could not ask.
     columns = [given.get(name, torch.zeros_like(situation.joints[few, 0])) for name in module.covariates]

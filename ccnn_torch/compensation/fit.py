@@ -378,7 +378,7 @@ def machine_alone(
             f"{nominal.name} takes {int(there.sum())} of {len(there)} of its poses, too few for a model"
         )
     given = {name: rows.covariates[name][there] for name in names}
-    fine = Situation(nominal, rows.joints[there], given, rows.gravity)
+    fine = Situation(nominal, rows.joints[there], given, rows.gravity, travel=rows.travel)
     inputs = torch.cat([fine.joints, *(given[name][:, None] for name in names)], -1)
     still, turning = torch.zeros_like(fine.joints), torch.zeros(inputs.shape[-1], dtype=torch.bool)
     weights = torch.ones(1, len(still), dtype=torch.float64)

@@ -128,9 +128,7 @@ def in_time(situation: Situation, time: Tensor) -> Situation:
 def one_row_at_a_time(situation: Situation) -> Situation:
     """The same rows as if each were isolated: without their times."""
     covariates = {name: value for name, value in situation.covariates.items() if name not in ("time", ROW)}
-    return Situation(
-        situation.mechanism, situation.joints, covariates, situation.gravity, situation.parameters, situation.guess
-    )
+    return replace(situation, covariates=covariates)
 
 
 def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Verdict:

@@ -79,6 +79,11 @@ class FoundMachine(NamedTuple):
         """With the identified parameters as its nominal ones."""
         return self.nominal.with_nominal(self.values)
 
+    @property
+    def travel(self) -> Tensor | None:
+        """As of `Situation`."""
+        return self.joints.mT if len(self.joints) else None
+
     def rows(self, count: int) -> Situation:
         """Rows all over the region, the same for the same machine.
 
@@ -94,7 +99,7 @@ class FoundMachine(NamedTuple):
         share = torch.rand(count, len(self.edges), generator=generator, dtype=torch.float64)
         values = self.edges[:, 0] + (self.edges[:, 1] - self.edges[:, 0]) * share
         given = {c.name: values[:, i] for i, c in enumerate(self.covariates)}
-        return Situation(self.nominal, joints, given, self.gravity)
+        return Situation(self.nominal, joints, given, self.gravity, travel=self.travel)
 
 
 def found_block(

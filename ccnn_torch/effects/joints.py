@@ -138,7 +138,8 @@ _LEAST_TRAVEL = 0.1
 class Transmission(OfJoints):
     """Δq_i = a_i sin(f_i q_i) + b_i cos(f_i q_i) and their harmonics up to the fourth; f_i unknown.
 
-    The second may be as large as the first (a gear's two teeth in mesh), the third and the fourth are small.
+    The second may be as large as the first (a gear's two teeth in mesh), the third and the fourth are small. A wave of
+    which rows show less than one and a half periods is a bend: beyond the travel of the rows it stays as it is there.
     """
 
     name = "transmission"
@@ -181,7 +182,7 @@ class Transmission(OfJoints):
 
     def moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
         """Waves of each joint."""
-        angle = of_rows(situation.motor_turns, rows) * shape.unsqueeze(-2)
+        angle = of_rows(_followed(situation, shape), rows) * shape.unsqueeze(-2)
         sine, cosine = torch.sin(angle), torch.cos(angle)
         waves = [sine, cosine]
         # The next harmonic by the sum of angles: sines are what a grid of hundreds of frequencies takes its time for.
@@ -189,6 +190,15 @@ class Transmission(OfJoints):
             s, c = waves[-2:]
             waves += [s * cosine + c * sine, c * cosine - s * sine]
         return torch.stack(waves, -1)
+
+
+def _followed(situation: Situation, shape: Tensor) -> Tensor:
+    """Turns of the motors that waves of these frequencies follow, `... x s x n`."""
+    held = situation.held_turns()
+    if held is None:
+        return situation.motor_turns
+    slow = shape * held[1] < 2 * math.pi * _FEWEST_PERIODS
+    return torch.where(slow.unsqueeze(-2), held[0], situation.motor_turns)
 
 
 def _frequencies(unit: str, travel: float) -> tuple[float, ...]:

@@ -102,6 +102,8 @@ class Situation:
             own base: a plate of sockets may stand in any direction.
         parameters: of the nominal machine, broadcast against the rows; None = its nominal ones.
         guess: poses near by, for mechanisms whose forward kinematics has no closed form, `... x s x p`; or None.
+        travel: lowest and highest joints, `2 x n` [SI], of the rows that effects were fitted to; None where that does
+            not matter. What follows a joint as no physical law says is held beyond them.
     """
 
     mechanism: Mechanism
@@ -110,6 +112,7 @@ class Situation:
     gravity: Tensor
     parameters: Tensor | None = None
     guess: Tensor | None = None
+    travel: Tensor | None = None
 
     @cached_property
     def machine(self) -> Mechanism:
@@ -279,6 +282,21 @@ class Situation:
     def motor_turns(self) -> Tensor:
         """How far the motor of each joint has turned, over its gear, at the commanded joints, `... x s x n`."""
         return turns_of(self.mechanism.motors, self.joints)
+
+    def held_turns(self) -> tuple[Tensor, Tensor] | None:
+        """`motor_turns` of joints held at the ends of `travel`, and how far each motor turns within, `n`; or None."""
+        if self.travel is None:
+            return None
+        low, high = self.travel
+        inside = torch.minimum(torch.maximum(self.joints, low), high)
+        motors = self.mechanism.motors
+        far = high - low if not motors else torch.tensor(motors, dtype=low.dtype).abs() @ (high - low)
+        return turns_of(motors, inside), far
+
+    def fitted_to(self, rows: Tensor) -> Situation:
+        """With the travel of some of the rows, `s` bool."""
+        joints = torch.cat([place.joints[rows] for place in self.places])
+        return replace(self, travel=torch.stack([joints.amin(0), joints.amax(0)]) if len(joints) else None)
 
     @cached_property
     def motor_jacobian(self) -> Tensor:

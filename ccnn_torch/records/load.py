@@ -241,8 +241,8 @@ def load_records(
     chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates, groups)
     doubt = "; ".join(filter(None, [doubt, _beyond_limits(mechanism, joints), _half_signs(table, chosen)]))
     unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
-    lacking = {c.name for c in mechanism.pose} - {c.name for c in coordinates}
-    if orientation == "none" or {*ROTATION_VECTOR} <= lacking:
+    lacking = [c.name for c in mechanism.pose if c.name not in {one.name for one in coordinates}]
+    if orientation == "none" or {*ROTATION_VECTOR} <= {*lacking}:
         check_orientation(table, mechanism, unused)
     if learns:
         _check_enough(table, len(mechanism.joints) + len(chosen))
@@ -253,8 +253,8 @@ def load_records(
             "record configurations that differ"
         )
     if lacking and not (orientation == "none" and len(coordinates) == 3):
-        parts = ", ".join(c.name for c in coordinates)
-        notes.append(f"of the pose only {parts} was measured; what moves nothing else is not seen")
+        parts, others = ", ".join(c.name for c in coordinates), ", ".join(lacking)
+        notes.append(f"of the pose only {parts} was measured: an error that {others} alone would show stays")
     notes = [
         *(f"joint '{name}' is constant and carries no information" for name in still),
         *notes,

@@ -173,7 +173,7 @@ def predict(model: LoadedModel, machine: Mechanism, records: Records, compensate
         real = real.placed(records.joints, pose) if isinstance(real, Instrument) else real
         predicted = real.forward_kinematics(records.joints, guess=guess)
         if model.machine.acting:
-            here = replace(rows, mechanism=nominal_of, gravity=model.machine.gravity)
+            here = replace(rows, mechanism=nominal_of, gravity=model.machine.gravity, travel=model.machine.travel)
             predicted = measured_pose(here, reached(here, model.machine.acting, real.nominal))
     else:
         there = rows.moved(ideal, None)

@@ -75,7 +75,7 @@ class Found:
             rows = Situation(self.nominal, low + (high - low) * share, {}, torch.zeros(3, dtype=torch.float64))
         there = torch.isfinite(self.identified.forward_kinematics(rows.joints)).all(-1)
         given = {name: value[there] for name, value in rows.covariates.items()}
-        return Situation(rows.mechanism, rows.joints[there], given, rows.gravity)
+        return Situation(rows.mechanism, rows.joints[there], given, rows.gravity, travel=rows.travel)
 
     @cached_property
     def truth(self) -> Tensor:
