@@ -18,7 +18,7 @@ from ccnn_torch.mechanisms.branches import EXACT, ROUNDED, arrives, follow
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.numerics.rotations import homogeneous, matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records.commanded import commanded_poses
-from ccnn_torch.records.headers import JOINT_LIMIT, pose_columns, read_pose, stack_columns
+from ccnn_torch.records.headers import JOINT_LIMIT, check_orientation, pose_columns, read_pose, stack_columns
 from ccnn_torch.records.joint_map import JointMap
 from ccnn_torch.records.table import Table
 from ccnn_torch.units import from_si, si_unit_of
@@ -71,7 +71,7 @@ class WantedPoses:
             measured = (machine if loaded.machine is None else loaded.machine.identified).nominal[-6:]
             wanted = torch.tensor([*tool], dtype=torch.float64)
             self._behind_pose = torch.linalg.inv(frames_of(wanted)) @ frames_of(measured)
-        self._first, self._region = torch.from_numpy(loaded.middle), torch.from_numpy(loaded.region)
+        self._first, self._region = torch.from_numpy(loaded.middle), torch.from_numpy(loaded.measured)
         self._before: Tensor | None = None
         self.chooses, self.goals, self.lost = False, goals, ""
         self._form: str | None = None
@@ -102,6 +102,13 @@ class WantedPoses:
             poses = torch.from_numpy(values)
         else:
             values, coordinates, self._form, read = read_pose(table, mechanism)
+            if isinstance(mechanism, SerialArm) and mechanism.orientation == "none":
+                whole = mechanism.with_orientation("rotation_vector")
+                if len(coordinates) > len(mechanism.pose):
+                    # The orientation was not measured, and is wanted all the same.
+                    self._mechanism = mechanism = whole
+                else:
+                    check_orientation(table, whole, [name for name in table.names if name not in read])
             if len(coordinates) != len(mechanism.pose):
                 missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
                 raise InputError(

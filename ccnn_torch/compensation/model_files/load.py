@@ -355,8 +355,8 @@ class LoadedModel:
 
     @cached_property
     def region(self) -> Array:
-        """Lowest and highest joints of the domain, `n x 2` [SI]; of a machine those measured, or of its workspace where
-        that is not known."""
+        """Lowest and highest joints of the domain, `n x 2` [SI]; of a machine those measured, or all over its workspace
+        where it holds there."""
         if self.machine is None:
             edges = [self.facts["domain"]["inputs"][c.name] for c in self.joints]
             return np.array([[edge["low"], edge["high"]] for edge in edges])
@@ -373,9 +373,20 @@ class LoadedModel:
         return region
 
     @property
+    def measured(self) -> Array:
+        """Lowest and highest joints of the records, `n x 2` [SI]; the region where these are not known."""
+        beside = None if self.machine is None or not len(self.machine.beside) else self.machine.beside
+        measured: Array = self.region if beside is None else beside.numpy()
+        return measured
+
+    @property
     def middle(self) -> Array:
-        """Joints to begin a search from: middle of the domain, of a machine its home, `n` [SI]."""
-        middle: Array = self.region.mean(-1) if self.machine is None else self.machine.nominal.home_joints.numpy()
+        """Joints to begin a search from: middle of those measured, of a machine without any its home, `n` [SI]."""
+        unknown = self.machine is not None and not (len(self.machine.joints) or len(self.machine.beside))
+        if self.machine is not None and unknown:
+            home: Array = self.machine.nominal.home_joints.numpy()
+            return home
+        middle: Array = self.measured.mean(-1)
         return middle
 
     def back(self, command: ArrayLike, covariates: ArrayLike | None = None) -> Array:

@@ -172,7 +172,7 @@ class Corrections:
                 pose = poses[at[k]]
                 if solved is None or there is None:
                     if guess is None:
-                        guess = nearest_measured(machine, torch.from_numpy(self._loaded.region), pose)
+                        guess = nearest_measured(machine, torch.from_numpy(self._loaded.measured), pose)
                     row = nearest_turns(machine, follow(machine, pose[None], guess, ROUNDED)[0], guess)
                     reached = bool(arrives(machine, row, pose, ROUNDED))
                 else:
