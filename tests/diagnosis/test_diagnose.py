@@ -95,6 +95,16 @@ def test_a_cause_that_the_library_lacks_is_outside_and_its_driver_is_named() -> 
     assert any("no measurement is proposed" in note for note in said.notes)
 
 
+def test_a_direction_of_what_is_no_joint_is_a_driver_too() -> None:
+    """As of a plate's belt behind the joints, `direction_phi`."""
+    situation = rows_of("five_bar", 120, 7)
+    way = torch.where(torch.rand(120, generator=torch.Generator().manual_seed(1)) < 0.5, -1.0, 1.0).double()
+    situation = replace(situation, covariates={**situation.covariates, "direction_phi": way})
+    pose = measured(situation, {}, 8) + 3e-4 * way[:, None]
+    said = diagnose_rows(situation, pose, effects=["frame", "backlash"])
+    assert said.verdict["driver"] == "direction phi" and "the direction of phi" in said.verdict["text"]
+
+
 def test_play_and_springs_that_cancel_are_not_taken_for_friction() -> None:
     """Edges of the play many times as large as the play, against a compliance, come near what friction does."""
     situation = rows_of("delta", 80, 3)

@@ -87,10 +87,12 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str], rows: int)
             continue
         d = unit_range(value.unsqueeze(-1))
         features = [one, d, _TIMES_PLACE * d * place]
-        if driver.startswith(SPEED):
+        if driver.startswith("direction"):
+            # Of anything but a joint it tells no load.
+            which = [i for i in range(len(mechanism.joints)) if driver == f"direction {i + 1}"]
+            features += [_BEND * d * _load_on_joint(situation, i) for i in which]
+        elif driver.startswith(SPEED):
             pass
-        elif driver.startswith("direction"):
-            features.append(_BEND * d * _load_on_joint(situation, int(driver.split()[1]) - 1))
         else:
             features.append(_BEND * _bumps(d, few))
             found.append(
@@ -125,7 +127,7 @@ def driver_of(name: str) -> str | None:
     if name.startswith("load_"):
         return f"load {name.removeprefix('load_')}"
     if name.startswith("direction"):
-        return f"direction {name.removeprefix('direction')}"
+        return f"direction {name.removeprefix('direction').removeprefix('_')}"
     if name.startswith(SPEED):
         return f"{SPEED} {name.removeprefix(SPEED)}"
     if is_temperature(name):

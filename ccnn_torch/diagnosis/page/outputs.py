@@ -306,7 +306,7 @@ def _unit(name: str) -> str:
 def _telling(view: _View, keep: Tensor, cause: str) -> tuple[float, Column]:
     """The column that a cause follows, and how well: the one that its name says, else the one that it follows best."""
     kind, _, which = cause.partition(" ")
-    columns = {"joint": which, "direction": f"direction{which}"}
+    columns = {"joint": which, "direction": f"direction{'' if which.isdigit() else '_'}{which}"}
     wanted = columns.get(kind, cause.replace(" ", "_"))
     named = [c for c in view.drivers if c[0] == wanted] or view.drivers
     shares = [_share(c[2][keep], view.fit[keep]) for c in named]

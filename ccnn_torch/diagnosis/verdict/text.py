@@ -94,7 +94,8 @@ def driver_words(driver: str | None) -> str:
         return "nothing that was recorded"
     kind, _, name = driver.partition(" ")
     load = f"the load along {name}" if name in ("x", "y", "z") else f"the load's moment {name}"
-    named = {"joint": f"joint {name}", "load": load, "direction": f"the direction of joint {name}"}
+    way = f"the direction of {'joint ' * name.isdigit()}{name}"
+    named = {"joint": f"joint {name}", "load": load, "direction": way}
     named["temperature"] = f"the temperature {name}"
     return _DRIVERS.get(driver) or (named.get(kind) if name else None) or driver
 
