@@ -137,7 +137,7 @@ def expand(
         raise MethodFailedError(
             f"the {what} is no polynomial of the joints: the best of degree {degrees[-1]} is off by "
             f"{share} of its largest value, where {worst:g} is allowed; measure a smaller part of the workspace, away "
-            "from singular poses"
+            "from singular poses, or give a class of your own a closed_form (docs/how_to/mechanisms.md)"
         )
     best[1].coefficients.mul_(size)
     return best[1]

@@ -400,12 +400,11 @@ class Situation:
 
     @cached_property
     def carried_torque(self) -> Tensor:
-        """Force or torque on each joint of the load, and of an arm's own weight where its file tells its masses, by
-        virtual work, `... x s x n` [N or N·m]: what springs of the drives carry."""
-        arm = self.whole.mechanism
-        if not isinstance(arm, SerialArm) or not len(arm.masses):
-            return self.load_torque
-        return self.load_torque + STANDARD_GRAVITY * arm.masses.sum() * self.own_weight_torque
+        """Force or torque on each joint of the load, and of the own weight that the machine's file tells (masses of an
+        arm, or of a platform), by virtual work, `... x s x n` [N or N·m]: what springs of the drives carry."""
+        machine = self.whole.mechanism
+        masses = machine.masses.sum() if isinstance(machine, SerialArm) else machine.platform_mass
+        return self.load_torque + STANDARD_GRAVITY * masses * self.own_weight_torque
 
     @cached_property
     def inner_weight_torque(self) -> Tensor:

@@ -228,7 +228,7 @@ def export_onnx(compensator: Compensator, metadata: str, outputs: Sequence[str] 
             f"an operator of this model has no kernel in ONNX Runtime in double ({str(reason).rpartition(' : ')[2]}); "
             "leave out the learner or the effect (instrument on a machine that turns) that brings it"
         ) from None
-    verify(compensator, lambda joints, covariates: run_onnx(session, joints, covariates), "ONNX", outputs)
+    verify(compensator, lambda joints, covariates: run_onnx(session, joints, covariates), outputs)
     return content
 
 
@@ -271,12 +271,11 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     return content
 
 
-def verify(compensator: Compensator, run: Any, form: str, outputs: Sequence[str] = OUTPUTS) -> None:
-    """Compare an exported form with the eager model, at random and at extreme points, in a batch and some one by one.
+def verify(compensator: Compensator, run: Any, outputs: Sequence[str] = OUTPUTS) -> None:
+    """Compare an exported graph with the eager model, at random and at extreme points, in a batch and some one by one.
 
     Args:
         run: (joints `s x n`, covariates `s x m` or None) -> outputs by name.
-        form: what the file is called in the error.
         outputs: that there are.
 
     Raises:
@@ -300,6 +299,7 @@ def verify(compensator: Compensator, run: Any, form: str, outputs: Sequence[str]
         wrong = [name for name, error in vectors.errors(found, outputs).items() if not error <= 1]
         if wrong:
             raise MethodFailedError(
-                f"the {form} export's output '{wrong[0]}' is not the model's to {share:.0e} of the limit; export with "
-                "other versions of torch or onnxruntime (tested ones: see the model card)"
+                f"the ONNX export's output '{wrong[0]}' is not the model's to {share:.0e} of the limit; of a class of "
+                "your own return NaN where the machine has no pose, else export with other versions of torch or "
+                "onnxruntime"
             )

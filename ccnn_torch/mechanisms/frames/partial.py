@@ -73,6 +73,7 @@ class Seen(Around, ABC):
             home_joints=inner.home_joints.tolist(),
         )
         self.mechanism, self.takes, self.gears, self.motors = inner, inner.takes, inner.gears, inner.motors
+        self.platform_mass = inner.platform_mass
 
     def inner_values(self, parameters: Tensor | None) -> Tensor | None:
         """Of the parameters `... x k` those of the mechanism inside; None where none are given."""
