@@ -8,7 +8,7 @@ import pytest
 from diagnosis_cases import CASES, indistinguishable, none, one_effect, outlier, outside, two_effects
 
 from ccnn_torch.diagnosis.page.data import About, about_of
-from ccnn_torch.diagnosis.page.first_screen import cards, first_screen, numbers_table, where_words
+from ccnn_torch.diagnosis.page.first_screen import cards, first_screen, joints_table, numbers_table, where_words
 from ccnn_torch.diagnosis.verdict.findings import findings, frequency_words, places, size_words
 from ccnn_torch.effects import EFFECTS, OUTLIER
 from ccnn_torch.effects.words import words_of
@@ -197,6 +197,20 @@ def test_places_are_told_in_words() -> None:
         region["share"] = 0.25
     assert "spread over the whole workspace" in where_words(results, about_of(labels))
     assert where_words(none()[0], About()) == []
+
+
+def test_a_joint_whose_error_has_no_name_is_not_said_to_have_none() -> None:
+    about = {"classes": {}, "probability": 0.999, "gap_before": 2e-3, "gap_after": 1e-3}
+    joints = [
+        {"joint": "q1", "effects": [], "driver": None, **about},
+        {"joint": "q2", "effects": [], "driver": "speed", **about},
+        {"joint": "q3", "effects": ["delay"], "driver": "speed", **about},
+    ]
+    table = joints_table({"joints": joints, "effects": [{"name": "delay", "parameters": {}}], "gap": {"unit": "rad"}})
+    assert table is not None
+    told = [(row[1], row[-1]) for row in table.rows]
+    assert told[:2] == [("–", "–"), ("what follows the speed and has no name", "–")]
+    assert told[2] == (words_of("delay").short, "a rest follows the speed")
 
 
 def test_of_several_joints_the_first_line_has_names_alone() -> None:

@@ -368,9 +368,11 @@ def joints_table(results: Block) -> Table | None:
                 told_words(b, b["value"]) for n, b in clear_parameters(numbers).items() if n.startswith(f"{name} ")
             ]
             rest += [f"or {words_of(other).short}" for other in own["classes"].get(effect, ())]
-        if own["driver"]:
-            rest.append(follows_words(own | {"drivers": []}).replace("follows", "a rest follows"))
-        what = ", ".join(words_of(effect).short for effect in own["effects"]) or "–"
+        what = ", ".join(words_of(effect).short for effect in own["effects"])
+        follows = follows_words(own | {"drivers": []}) if own["driver"] else ""
+        if follows and what:
+            rest.append(f"a rest {follows}")
+        what = what or (f"what {follows} and has no name" if follows else "–")
         removed = " → ".join(size_text(own[key], results["gap"]) for key in ("gap_before", "gap_after"))
         sure = probability_words(own["probability"])
         name = f"{name} {own.get('word', '')}".strip()
