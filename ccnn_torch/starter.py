@@ -280,12 +280,13 @@ def starter_config(
                 f"{records}: looks like a motion's log; name its columns time[s], command1[rad], q1[rad] (or deg, mm) "
                 f"and current1[A] if there is one, then ccnn diagnose --motion {records} --mechanism servo reads it"
             )
-        what = "measured pose (x, y, z …)"
+        what, own = "measured pose (x, y, z …)", "x"
         if not (found.joints or found.goals):
-            what = "joint (q1, J1, A1, joint_1 …) or a commanded pose (goal_x, goal_y …)"
+            what, own = "joint (q1, J1, A1, joint_1 …) or a commanded pose (goal_x, goal_y …)", "q1"
+        first = next((n for n in table.names if _kind(table.units[n]) in ("rad", "m")), table.names[0])
         raise InputError(
-            f"{records}: no column looks like a {what}; it has {', '.join(table.names)}: rename columns, or write the "
-            "config by hand (docs/how_to/records.md)"
+            f"{records}: no column looks like a {what}; it has {', '.join(table.names)}: rename them, or write a config "
+            f'with columns: {{"{table.header(first)}": "{own}[{table.units[first] or "deg"}]", …}} (docs/how_to/records.md)'
         )
     machine, name, why = _machine(found, table, mechanism, ask, given)
     columns = _columns(found, table, machine, units, ask)

@@ -158,7 +158,7 @@ def test_joints_as_a_urdf_and_as_drivers_name_them(tmp_path: Path) -> None:
 
 
 def test_tables_without_joints_or_with_strange_text(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="looks like a joint"):
+    with pytest.raises(InputError, match=r'looks like a joint .* columns: \{"x\[mm\]": "q1\[mm\]", …\}'):
         starter_config(write(tmp_path / "a.csv", ["x[mm]", "y[mm]"], np.zeros((3, 2))), tmp_path / "a.yaml")
     with pytest.raises(InputError, match="measured pose"):
         starter_config(write(tmp_path / "b.csv", ["q1[deg]", "q2[deg]"], np.zeros((3, 2))), tmp_path / "b.yaml")
