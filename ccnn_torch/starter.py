@@ -275,7 +275,7 @@ def starter_config(
     named = urdf_joints(mechanism) if mechanism and mechanism.lower().endswith(".urdf") else ()
     found = recognise(table, named, () if given is None else [c.name for c in given.pose])
     if not (found.joints or found.goals) or not found.pose:
-        if {"time", "command"} <= {name.rstrip("0123456789_ ") for name in map(str.lower, table.names)}:
+        if {"time", "command"} <= {name.lower().rstrip("0123456789_ ") for name in table.names}:
             raise InputError(
                 f"{records}: looks like a motion's log; name its columns time[s], command1[rad], q1[rad] (or deg, mm) "
                 f"and current1[A] if there is one, then ccnn diagnose --motion {records} --mechanism servo reads it"
@@ -284,9 +284,9 @@ def starter_config(
         if not (found.joints or found.goals):
             what, own = "joint (q1, J1, A1, joint_1 …) or a commanded pose (goal_x, goal_y …)", "q1"
         first = next((n for n in table.names if _kind(table.units[n]) in ("rad", "m")), table.names[0])
+        told = f'columns: {{"{table.header(first)}": "{own}[{table.units[first] or "deg"}]", …}}'
         raise InputError(
-            f"{records}: no column looks like a {what}; it has {', '.join(table.names)}: rename them, or write a config "
-            f'with columns: {{"{table.header(first)}": "{own}[{table.units[first] or "deg"}]", …}} (docs/how_to/records.md)'
+            f"{records}: no column looks like a {what}; it has {', '.join(table.names)}: rename, or give {told}"
         )
     machine, name, why = _machine(found, table, mechanism, ask, given)
     columns = _columns(found, table, machine, units, ask)

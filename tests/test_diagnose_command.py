@@ -280,6 +280,24 @@ def test_columns_by_another_name_are_said(cli: Cli, rows: Path, tmp_path: Path) 
     assert code == 0 and "not evaluated" not in shown, told
 
 
+def test_where_the_frame_is_off_a_command_fits_it_first(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("--mechanism", "delta", "--rows", "60", "--noise", "1e-5", "--seed", "1")
+    code, _, told = cli("simulate", *words, "--effect", "frame:x=0.003,ry=0.004", "--out", "rows.csv")
+    assert code == 0, told
+    words = ("--records", "rows.csv", "--mechanism", "delta", "--noise", "1e-5", "--no-network", "--effects", "frame")
+    code, shown, told = cli("diagnose", *words, "--out", "found")
+    assert code == 0, told
+    *_, run = (shlex.split(line) for line in shown.splitlines() if line.startswith("  ccnn run"))
+    assert "mechanism=framed" in run and 'mechanism_keys={"mechanism": "delta", "base": true}' in run
+    code, shown, told = cli(*run[1:], "methods=[constant]", "save_models=false", "save_report=false")
+    assert code == 0, told
+    position = json.loads(Path("found_compensator/results.json").read_text("utf-8"))["pose"]["position"]
+    assert position["before"]["rms"]["median"] < 1e-4
+
+
 def test_the_command_on_the_screen_puts_the_effect_in_a_compensator(
     cli: Cli, rows: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

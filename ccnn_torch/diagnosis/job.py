@@ -23,10 +23,11 @@ from ccnn_torch.diagnosis.result import Said
 from ccnn_torch.diagnosis.verdict.text import both_sides
 from ccnn_torch.display import short_path, typed_path
 from ccnn_torch.effects import OUTLIER
+from ccnn_torch.effects.constant import Frame
 from ccnn_torch.effects.time import Homing
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import sweep
-from ccnn_torch.mechanisms import Mechanism, load_mechanism, simulated_rows
+from ccnn_torch.mechanisms import Framed, Mechanism, Seen, SerialArm, load_mechanism, simulated_rows
 from ccnn_torch.plugins import names_code, permission
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.json_files import read_json
@@ -190,15 +191,26 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
     if covariates is not None:
         keys["covariates"] = f"[{','.join(covariates)}]"
     keys["out"] = f"{typed_path(str(path.parent))}_compensator"
-    run = " ".join(["ccnn run", *(shlex.quote(f"{key}={value}") for key, value in keys.items())])
-    own = names_code(diagnosis.analysis.situation.mechanism.describe())
+    run, machine = _run_line(keys), diagnosis.analysis.situation.mechanism
+    own = names_code(machine.describe())
     rest = f"TARGETS.csv COMMANDS.csv --pose{permission(own)}"
     if diagnosis.machine is None:
         model = shlex.quote(f"{keys['out']}/model.safetensors")
         sentence = "No model holds these effects by themselves: these lines learn the gap and correct targets."
         return sentence, run, f"ccnn compensate {model} {rest}"
     sentence = "the first line corrects targets by these effects alone, the second one trains a model of all that pays."
-    return sentence, f"ccnn compensate {shlex.quote(typed_path(str(path)))} {rest}", run
+    lines = [f"ccnn compensate {shlex.quote(typed_path(str(path)))} {rest}", run]
+    has_frames = isinstance(machine, SerialArm | Framed | Seen) or not {"x", "y", "z"} <= {c.name for c in machine.pose}
+    if Frame.name in verdict["effects"] and not has_frames:
+        inside = {"mechanism": keys["mechanism"], "base": True, "keys": config.mechanism_keys}
+        keys |= {"mechanism": "framed", "mechanism_keys": json.dumps({k: v for k, v in inside.items() if v})}
+        lines.append(_run_line(keys))
+        sentence = f"{sentence[:-1]}; the third one fits the frame first, where it is the measuring device's own."
+    return sentence, *lines
+
+
+def _run_line(keys: Mapping[str, str]) -> str:
+    return " ".join(["ccnn run", *(shlex.quote(f"{key}={value}") for key, value in keys.items())])
 
 
 def _records(config: DiagnoseConfig) -> str:
