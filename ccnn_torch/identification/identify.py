@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.config.split import Given
 from ccnn_torch.display import typed_path
-from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.errors import MethodFailedError, WriteError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig, base_method
@@ -242,13 +242,19 @@ def _run(config: IdentifyConfig, _data: None, folder: RunFolder, quiet: bool, de
             return lambda done: bar.update(task, completed=done)
 
         found = identify(config, path / "methods", watch)
-    if details is not None and not quiet:
-        # Before anything is written: what was found is not lost where the disk is full.
-        where = "the report" if config.save_report else RESULTS
-        identified_page(found.results, folder=typed_path(str(path))).show(stdout, details, where)
+    page = identified_page(found.results, folder=typed_path(str(path)))
+    where = "the report" if config.save_report else RESULTS
     note("writing tables, plots and files …", quiet)
     with resume_hint(f"ccnn identify --resume {path}"):
-        write_outputs(found, path)
+        try:
+            write_outputs(found, path)
+        except WriteError:
+            # What was found is not lost where the disk is full.
+            page.show(stdout, bool(details), where)
+            raise
+    # Written already: whoever reads the screen may stop to.
+    if details is not None and not quiet:
+        page.show(stdout, details, where)
     if not quiet:
         place = typed_path(str(path))
         say_place(f"Everything is in {place}" + (f"; open {place}/report.html" if config.save_report else ""))

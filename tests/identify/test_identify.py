@@ -11,11 +11,13 @@ from scipy.optimize import approx_fprime, least_squares
 
 import ccnn_torch
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.identify import Identification
+from ccnn_torch.identification.config import IdentifyConfig
+from ccnn_torch.identification.identify import IDENTIFY, Identification
 from ccnn_torch.identification.measured import make_kinematics, notes_of
 from ccnn_torch.identification.simulated import Places, PointsView
 from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
 from ccnn_torch.records import load_records, write_table
+from ccnn_torch.report.page import Page
 
 FIVE_BAR: dict[str, Any] = {
     "machines": 60,
@@ -216,6 +218,21 @@ def test_an_arm_from_records_out_again_as_dh_file_and_urdf(tmp_path: Path) -> No
         again = load_mechanism(str(tmp_path / "out" / name))
         assert isinstance(again, SerialArm)
         assert float((again.forward_frame(joints)[0] - expected[0]).norm(dim=-1).max()) < 2e-4
+
+
+def test_the_machine_is_written_before_a_screen_that_nobody_reads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`ccnn identify … | head -1` closes the pipe."""
+
+    def closed(*_: object) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(Page, "show", closed)
+    keys = {"mechanism": "five_bar", "simulate": {"machines": 1, "poses": 12}, "save_report": False}
+    with pytest.raises(BrokenPipeError):
+        IDENTIFY.start(IdentifyConfig.from_keys(**keys, out=str(tmp_path / "found")))
+    assert (tmp_path / "found" / "identified.yaml").is_file()
 
 
 def test_links_are_fitted_without_gross_outliers_and_the_note_names_their_lines(tmp_path: Path) -> None:
