@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.calibration.page import verdict
 from ccnn_torch.calibration.prepare import over_all_rows, prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.compensation import PhysicalEffects, expand_effects, load_model
@@ -459,9 +460,15 @@ def test_a_gross_outlier_is_not_learned_from_and_is_judged_where_it_is_held_out(
     assert flagged == wrong[:1]
     assert not bool(rows.dataset.usable[0, wrong[0]]) and bool(rows.dataset.usable[0, wrong[1]])
     assert any("misses them by more than ten times the usual" in note for note in rows.notes)
-    position = calibrate(**keys(played, records=str(tmp_path / "rows.csv"))).results["pose"]["position"]
+    results = calibrate(**keys(played, records=str(tmp_path / "rows.csv"))).results
+    position = results["pose"]["position"]
     others = position["without_outliers"]
     assert others["rows"] == 1 and 10 * others["after"]["median"] < position["after"]["rms"]["median"]
+    # What is told first is of the rows that say something of the model.
+    left, right = (f"{1e6 * others[when]['median']:.3g}" for when in ("before", "after"))
+    told = verdict(results)
+    assert ", without 1 row far from every model, geometry + effects" in told and "; with it " in told
+    assert told.index(f"({left} → {right} µm") < told.index("; with it ")
 
 
 def test_rows_that_no_machine_takes_are_one_sentence(tmp_path: Path) -> None:

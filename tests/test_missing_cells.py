@@ -101,6 +101,9 @@ def test_what_is_blank_and_what_is_not(tmp_path: Path) -> None:
     refused("0.4,0.4,0.4,nan,,0.1", "column 'x' has 'nan' at line 31")
     refused("0.4,,0.4,,,0.1", "column 'q2' is empty at line 31")
     refused("0.4,0.4,0.4,,,", "nothing of the pose was measured at line 31")
+    # All at once: the next try would find the next one.
+    lines[40:42] = ["0.4,,0.4,,,0.1"] * 2
+    refused("0.4,,,,,0.1", "column 'q2' is empty at lines 31, 41, 42", "also empty in q3 at line 31 (row 30); write")
     # Blank in all rows is no column.
     empty = write(tmp_path / "e.csv", machine, joints, torch.cat([pose[:, :2] * NAN, pose[:, 2:]], -1))
     assert [c.name for c in load_records(empty, machine, learns=False).pose_coordinates] == ["z"]

@@ -121,6 +121,16 @@ def test_a_network_is_part_of_the_model(tmp_path: Path) -> None:
     assert said.changed[0].numbers[0].value == pytest.approx(4e-4, rel=0.1)
 
 
+def test_a_change_of_several_numbers_is_told_with_those_that_are_clear_of_0(identified: Path, tmp_path: Path) -> None:
+    joints = drawn(30, 12)
+    write(tmp_path / "new.csv", joints, 30, shift=np.array([8e-4, 0.0, 0.0]))
+    said = ccnn_torch.since(identified, tmp_path / "new.csv")
+    (told,) = said.changed
+    clear = [number for number in told.numbers if abs(number.value) > 1.96 * number.sd]
+    assert len(told.numbers) > len(clear) > 0, said.text
+    assert f"({clear[0].name} {1e6 * clear[0].value:+.3g} ± " in said.text and "more are not clear of 0)" in said.text
+
+
 def test_the_command_and_its_files(
     cli: Callable[..., tuple[int, str, str]], identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -240,6 +240,36 @@ def test_an_identified_machine(tmp_path: Path) -> None:
     assert settings["rotation_weight"] == RunConfig.model_fields["rotation_weight"].default
 
 
+def test_a_diagnosis_promises_what_its_rows_left_under_fits_to_others(tmp_path: Path, cli: Cli) -> None:
+    """A machine that had been hit passed with exit code 0: its diagnosis.json promised no figure."""
+    rows, out = delta_rows(tmp_path / "rows.csv", seed=7), tmp_path / "d"
+    words = (rows, "--mechanism", DELTA, "--effects", "joint_offset", "--out", out)
+    assert cli("diagnose", *words)[0] == 0
+    promise = json.loads((out / "diagnosis.json").read_text())["promise"]
+    assert promise["position"]["rms"] == pytest.approx(3**0.5 * NOISE, rel=0.2) and promise["rows"] == 80
+    same, hit = (
+        delta_rows(tmp_path / f"{seed}.csv", seed=seed, command=None if size is None else wanted(seed, 80) + size)
+        for seed, size in ((8, None), (9, torch.tensor([0.0, 4e-4, 0.0], dtype=torch.float64)))
+    )
+    code, said, err = cli("verify", out / "diagnosis.json", same, "--out", tmp_path / "v")
+    assert code == 0 and "The promise is kept" in said, err
+    assert cli("verify", out / "diagnosis.json", hit, "--out", tmp_path / "v")[0] == 1
+    said = ccnn_torch.since(out / "diagnosis.json", hit)
+    assert [told.name for told in said.changed] == ["joint_offset q2"], said.text
+
+
+def test_a_coordinate_that_the_new_rows_lack_is_named(tmp_path: Path) -> None:
+    """A header of another spelling was left out, and the promise kept by y and z alone, without a word."""
+    for name, seed, header in (("rows", 1, "X Ist"), ("new", 2, "X_Ist")):
+        path = delta_rows(tmp_path / f"{name}.csv", seed=seed)
+        path.write_text(path.read_text().replace("x[m]", f"{header}[m]"))
+    keys = {"columns": {"X Ist[m]": "x[m]"}, "save_report": False}
+    ccnn_torch.identify(mechanism=DELTA, records=str(tmp_path / "rows.csv"), **keys).save(tmp_path)
+    (note,) = ccnn_torch.verify(tmp_path / "identified.yaml", tmp_path / "new.csv").notes
+    assert note.startswith("x ('X Ist' in the model's records) is not among these rows, which are judged by y, z alone")
+    assert "column 'X_Ist'" in note
+
+
 def test_the_limit_is_passed_once_in_twenty() -> None:
     generator = torch.Generator().manual_seed(0)
     groups = torch.arange(30)

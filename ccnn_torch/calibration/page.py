@@ -20,7 +20,7 @@ from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.plugins import permission
 from ccnn_torch.report.page import Answer, InlineFigure, Page, sections_of
 from ccnn_torch.report.results.base import Spread, interval_text, removed_percent
-from ccnn_torch.report.results.run import Before, Method, MethodPose, ModelFiles, Mse, RmsMax, RunResults
+from ccnn_torch.report.results.run import Before, Method, MethodPose, ModelFiles, Mse, PoseFigures, RmsMax, RunResults
 from ccnn_torch.report.table import Table, table_of
 
 # By less a learned part may be worse on other rows by chance: 100 rows tell an RMS error to 4 %, one to sqrt(1 / 600).
@@ -58,12 +58,12 @@ def _answers(results: RunResults, folder: Path | None) -> list[Answer]:
     """What each part of the model leaves of the RMS position error, where it has parts, and what to do next."""
     (kind, error), best, told = results.pose.told, results.best_method, list[Answer]()
     if best is not None and results.pose.parts:
-        steps = [("as it is", error.before), *((part, error[part]) for part in results.pose.parts)]
+        steps = {"before": "as it is", **{part: f"with {part}" for part in results.pose.parts}, "after": f"with {best}"}
         parts = []
-        for name, block in [*steps, (best, error.after)]:
-            size = with_unit(block.rms.median, error.unit)
-            parts.append(f"{size} {name}" if name == "as it is" else f"with {name} {size}")
-        told.append(Answer("Step by step", f"{', '.join(parts)} (RMS {kind} error on held-out rows)."))
+        for key, name in steps.items():
+            size = with_unit(one.median if (one := error.led(key)) else None, error.unit)
+            parts.append(f"{size} {name}" if key == "before" else f"{name} {size}")
+        told.append(Answer("Step by step", f"{', '.join(parts)} (RMS {kind} error on held-out rows{_but(error)})."))
     if folder is not None and results.records is not None:
         path = typed_path(str(folder))
         if not pays(results):
@@ -86,17 +86,17 @@ def verdict(results: RunResults) -> str:
     # What is left is left of both: the identified geometry, and what the method learned of the rest.
     whose = " + ".join([*results.pose.parts, best])
     rows = count_text(results.rows.test, "held-out row")
-    before, after = error.before.rms, error.after.rms
+    before, after, but = error.led("before"), error.led("after"), _but(error)
     removed = removed_percent(before, after)
-    if removed is None:
+    if removed is None or before is None or after is None:
         return f"On {rows} the pose error of {whose} could not be measured."
     left, right, unit = _both(before.median, after.median, error.unit)
     did = f"removes {removed:.1f} %" if removed >= 0 else f"adds {-removed:.1f} %"
-    text = f"On {rows} {whose} {did} of the RMS {kind} error ({left} → {right} {unit})"
-    others = error.without_outliers
-    if others is not None:
-        left, right, unit = _both(others.before.median, others.after.median, error.unit)
-        text += f"; {left} → {right} {unit} without {count_text(others.rows, 'row')} far from every model"
+    text = f"On {rows}{but and f'{but},'} {whose} {did} of the RMS {kind} error ({left} → {right} {unit}"
+    if error.without_outliers is not None:
+        left, right, unit = _both(error.before.rms.median, error.after.rms.median, error.unit)
+        text += f"; with {'it' if error.without_outliers.rows == 1 else 'them'} {left} → {right} {unit}"
+    text += ")"
     ratio = methods[best].ratio_to_floor if best in methods else None
     if ratio is not None and ratio.median is not None:
         text += f"; its mean squared joint error is {number_text(ratio.median, 3)} times the noise floor"
@@ -104,6 +104,12 @@ def verdict(results: RunResults) -> str:
         if constant is not None and constant.median is not None:
             text += f" (a constant correction: {number_text(constant.median, 3)})"
     return text + "."
+
+
+def _but(error: PoseFigures) -> str:
+    """Of which held-out rows the figures are not that a sentence leads with."""
+    others = error.without_outliers
+    return "" if others is None else f", without {count_text(others.rows, 'row')} far from every model"
 
 
 def _both(before: float | None, after: float | None, of: str) -> tuple[str, str, str]:
@@ -153,7 +159,7 @@ def pays(results: RunResults) -> bool:
     """Whether the model leaves less on held-out rows than no correction does, and than its own parts where all targets
     are reached."""
     _, error = results.pose.told
-    removed, worse = removed_percent(error.before.rms, error.after.rms), worse_text(results)
+    removed, worse = removed_percent(error.led("before"), error.led("after")), worse_text(results)
     return (not worse or worse.endswith(_HELD_BACK)) and (removed is None or removed > 0)
 
 
@@ -163,12 +169,13 @@ def worse_text(results: RunResults) -> str:
     Without it: the best of no correction, identified geometry, and known effects with it.
     """
     (kind, error), best, parts = results.pose.told, results.best_method, results.pose.parts
-    steps = {"no correction at all": error.before.rms.median}
+    size = {key: one.median for key in ("before", *parts, "explained", "after") if (one := error.led(key))}
+    steps = {"no correction at all": size["before"]}
     for k, part in enumerate(parts):
-        steps[f"{' + '.join(parts[: k + 1])} alone"] = error[part].rms.median
+        steps[f"{' + '.join(parts[: k + 1])} alone"] = size[part]
     # Of steps as good as each other the last one says more.
     instead, alone = min(reversed(steps.items()), key=lambda step: step[1] or math.inf)
-    after = error.after.rms.median
+    after = size["after"]
     if best is None or not alone or after is None or after <= _WORSE * alone:
         return ""
     left, right, unit = _both(alone, after, error.unit)
@@ -176,7 +183,7 @@ def worse_text(results: RunResults) -> str:
     if parts and instead.startswith(" + ".join(parts)):
         what = best
     text = f"On held-out rows {what} makes it worse than {instead} ({left} → {right} {unit} RMS {kind} error)"
-    if parts and error.explained is not None and (error.explained.rms.median or after) <= _WORSE * alone:
+    if parts and "explained" in size and (size["explained"] or after) <= _WORSE * alone:
         return text + _HELD_BACK
     if "effects" in parts and "effects" not in instead:
         return f"{text}: effects=none leaves the effects out."

@@ -279,8 +279,10 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, outcome: Out
     far = known & ~inlying(least, known, 3, 0)
     if not bool(far.any()):
         return pose
-    others = pose_block(found["before"][0], found["after"][0], weights * ~far).position
-    told = WithoutOutliers(rows=int(far.sum(1).max()), before=others.before.rms, after=others.after.rms)
+    kept = {name: error for name, (error, _) in found.items() if name != "not_compensable"}
+    others = pose_block(weights=weights * ~far, rotation_weight=None, **kept).position
+    sizes = {name: others[name].rms for name in kept}
+    told = WithoutOutliers(rows=int(far.sum(1).max()), **sizes)
     return pose.model_copy(update={"position": pose.position.model_copy(update={"without_outliers": told})})
 
 

@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
 from ccnn_torch.diagnosis.from_records import constant_columns, naming
 from ccnn_torch.diagnosis.page.data import RESULT, About, about_of, load_labels
 from ccnn_torch.diagnosis.page.first_screen import first_screen
-from ccnn_torch.diagnosis.page.outputs import write_diagnosis, write_result
+from ccnn_torch.diagnosis.page.outputs import promise_of_verdict, write_diagnosis, write_result
 from ccnn_torch.diagnosis.page.report import print_diagnosis
 from ccnn_torch.diagnosis.progress import TO_REPORT, TO_VERDICT, watched
 from ccnn_torch.diagnosis.result import Said
@@ -117,7 +117,7 @@ def _verdict(config: DiagnoseConfig, tell: Callable[..., None]) -> Diagnosis:
         said = diagnose(records, mechanism, **keys)
     if said.machine is not None:
         said.machine.update(columns=config.columns, joint_map=config.joint_map)
-    return said
+    return said.with_entries(promise=promise_of_verdict(said, config.seed))
 
 
 def _complete(config: DiagnoseConfig, folder: Path, said: Diagnosis, quiet: bool) -> list[str]:

@@ -19,7 +19,7 @@ from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig, base_method
 from ccnn_torch.identification.constrained import identify_by_constraint
 from ccnn_torch.identification.judge import drawn_errors, read_elsewhere, transferred
-from ccnn_torch.identification.measured import Measured, Rows, from_records, held_by_priors, nominal_machine
+from ccnn_torch.identification.measured import Measured, from_records, held_by_priors, nominal_machine
 from ccnn_torch.identification.page import identified_page, not_settled, write_identified_csv, write_identified_report
 from ccnn_torch.identification.result import Found, assemble, beside_truth, judged, known_at, promised
 from ccnn_torch.identification.simulated import count_study, simulate
@@ -34,9 +34,9 @@ from ccnn_torch.identification.solve import (
     save_outcome,
     select,
     solver_of,
+    without_far_rows,
 )
-from ccnn_torch.mechanisms import Framed, Giving, Mechanism, SerialArm, SetUps
-from ccnn_torch.mechanisms.frames.judge import far_rows
+from ccnn_torch.mechanisms import Framed, Giving, Mechanism, SetUps
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
@@ -131,6 +131,8 @@ def identify(
     if held.constraint is not None:
         progress = None if watch is None else watch("lm")
         return Identification(config, *identify_by_constraint(held, progress, given), given=given)
+    sound = without_far_rows(measured, config)
+    measured = frames_first(sound, config) if sound.doubts else sound
     elsewhere = read_elsewhere(config, mechanism)
     for method in config.methods:  # refuse what cannot be solved before anything takes minutes
         solver_of(method, config)
@@ -159,13 +161,7 @@ def _refitted(config: IdentifyConfig, measured: Measured, method: str, found: Fo
     """The same with the values that all rows give, held-out ones among them, and what is known of these."""
     if not config.fits_again() or not measured.test.joints.shape[1] or base_method(method) not in QUICK:
         return found
-    arm, test = measured.mechanism, measured.test
-    if isinstance(arm, SerialArm):
-        # Of the held-out rows, too, gross outliers are not fitted to.
-        error = arm.pose_error(arm.forward_kinematics(test.joints, found.outcome.values[:, None]), test.observed)
-        far = far_rows(error, ~test.observed.isnan().any(-1))[1].any(0)
-        test = Rows(test.joints[:, ~far], test.observed[:, ~far])
-    whole = replace(measured, rows=measured.rows.and_these(test))
+    whole = replace(measured, rows=measured.rows.and_these(measured.test))
     outcome = run_method(method, whole, config)
     if not bool(outcome.converged.all()):
         return found

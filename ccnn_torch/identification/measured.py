@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -138,6 +138,9 @@ class Measured:
         joint_noise: of the recorded joints, `n` [SI]; None where there is none.
         data_hash: SHA-256 of the records; empty for simulated data.
         notes: sentences for the person who reads the results.
+        doubts: those of them that come first.
+        name_rows: formats numbers of rows, held-out ones behind the others, as the user knows them; None for simulated
+            data.
     """
 
     mechanism: Mechanism
@@ -155,6 +158,8 @@ class Measured:
     joint_noise: Tensor | None = None
     data_hash: str = ""
     notes: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    name_rows: Callable[[Sequence[int]], str] | None = None
 
     @property
     def machines(self) -> int:
@@ -220,6 +225,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         train, test = (rows.with_more(torques[i]) for rows, i in ((train, split.train), (test, split.test)))
         start = torch.nn.functional.pad(start, (0, len(giving)))
         joint_noise = None if joint_noise is None else torch.nn.functional.pad(joint_noise, (0, len(giving)))
+    numbers = torch.cat([split.train, split.test]).numpy()
     return Measured(
         mechanism=mechanism,
         kinematics=Kinematics(mechanism),
@@ -231,6 +237,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         joint_noise=joint_noise,
         data_hash=records.data_hash,
         notes=[*held_out_notes(config.split, len(split.test), split), *notes_of(records), *far],
+        name_rows=lambda rows: records.name_rows(numbers[rows]),
     )
 
 

@@ -160,7 +160,7 @@ def assemble(
         "compensation": None,
         "singular_values": known.singular_values,
         "noise_ratio": figures({"value": known.noise}),
-        "doubts": doubts,
+        "doubts": [*measured.doubts, *doubts],
         "counts": [],
         "paper": None,
         "data_sha256": measured.data_hash or None,

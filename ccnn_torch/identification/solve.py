@@ -28,9 +28,11 @@ from ccnn_torch.identification.config import PER_LEG, IdentifyConfig, base_metho
 from ccnn_torch.identification.measured import Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
 from ccnn_torch.identification.problems.poses import compares_poses
-from ccnn_torch.identification.problems.problem import part_of
+from ccnn_torch.identification.problems.problem import WeightedRows, part_of
 from ccnn_torch.identification.solvers import get_solver
 from ccnn_torch.mechanisms import Framed, Mechanism
+from ccnn_torch.mechanisms.frames.judge import OUTLIERS
+from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.training import load_checkpoint, save_checkpoint
 
 QUICK = ("lm", "tikhonov")
@@ -162,6 +164,35 @@ def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
     found = get_solver("lm")(problem, config.seed)
     start = select_parameters(measured.mechanism.geometry, choice, closed).full(found.values)
     return replace(measured, start=start)
+
+
+def without_far_rows(measured: Measured, config: IdentifyConfig) -> Measured:
+    """Without the rows, held-out ones too, that a robust fit to all of them shows to be gross outliers, and named.
+
+    Rows that have no names (simulated ones) stay, and all where the config has a robust loss of its own.
+    """
+    if measured.name_rows is None or config.robust is not None:
+        return measured
+    whole = replace(measured, rows=measured.rows.and_these(measured.test))
+    found = run_method("lm", whole, config.model_copy(update={"robust": "cauchy"}))
+    (problem,) = pieces_of(whole, config, False, found.machines, found.values)
+    values = select(measured, config).free(found.values)
+    length = WeightedRows(problem).residuals(values[:, None], found.machines)[0, 0].norm(dim=-1)
+    near = inlying(length, torch.ones_like(length) > 0, len(problem.channels), values.shape[-1])
+    far = torch.nonzero(~near).squeeze(-1).tolist()
+    if not far or len(far) > OUTLIERS * len(near) or not bool(found.converged.all()):
+        return measured
+    train = measured.rows.joints.shape[1]
+    rows, test = (
+        Rows(rows.joints[:, kept], rows.observed[:, kept])
+        for rows, kept in zip((measured.rows, measured.test), (near[:train], near[train:]), strict=True)
+    )
+    one = len(far) == 1
+    said = (
+        f"{len(far)} {'row is' if one else 'rows are'} far off among the others, mistyped or mismeasured, and left out "
+        f"of the fit and of the held-out error: {measured.name_rows(far)}; correct or remove {'it' if one else 'them'}."
+    )
+    return replace(measured, rows=rows, test=test, doubts=[*measured.doubts, said])
 
 
 def is_apart(method: str, config: IdentifyConfig) -> bool:

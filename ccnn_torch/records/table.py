@@ -135,11 +135,13 @@ class Table:
         values = self.raw(name)
         wrong = np.flatnonzero(~np.isfinite(values) & ~(self.blank(name) & gaps))
         if len(wrong):
-            row = int(wrong[0])
-            text = visible(self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}"), 40)
+            texts = [self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}") for row in wrong.tolist()]
+            rows, text = wrong[[text == texts[0] for text in texts]], visible(texts[0], 40)
             what = f"has '{text}'" if text else "is empty"
-            more = f", and {len(wrong) - 1} more of its cells are not finite either" if len(wrong) > 1 else ""
-            remedy = "write a finite number or remove the row"
+            rest = len(wrong) - len(rows)
+            more = f", and {rest} more of its cells are not finite either" if rest else ""
+            more += "" if text else self._other_gaps(name)
+            remedy = f"write a finite number or remove the row{'s' if more or len(rows) > 1 else ''}"
             if _GROUPED.fullmatch(text):
                 remedy = "write numbers without thousands separators"
             elif _COMMA.fullmatch(text):
@@ -147,7 +149,7 @@ class Table:
                 remedy = (
                     f"write its decimal comma as a point ({point}), or all numbers with a comma and ; between cells"
                 )
-            raise InputError(f"{self.path}: column '{name}' {what} at {self.name_rows([row])}{more}; {remedy}")
+            raise InputError(f"{self.path}: column '{name}' {what} at {self.name_rows(rows)}{more}; {remedy}")
         converted = to_si(values, unit or "1", si_unit, f"{self.path}: column '{name}'", name)
         far = np.flatnonzero(np.abs(converted) > LARGEST)
         if len(far):
@@ -157,6 +159,16 @@ class Table:
                 f"{'it' if len(far) == 1 else 'them'}, or check the unit"
             )
         return converted
+
+    def _other_gaps(self, name: str) -> str:
+        """Which other columns have empty cells, and where; those that are mostly empty are meant to be."""
+        found: dict[str, list[str]] = {}
+        for other in self.names:
+            blank = np.flatnonzero(self.blank(other))
+            if other != name and len(blank) and np.isfinite(self.raw(other)).mean() > 0.5:
+                found.setdefault(self.name_rows(blank), []).append(other)
+        named = [f"{', '.join(names)} at {rows}" for rows, names in found.items()]
+        return f"; cells are also empty in {', in '.join(named)}" if named else ""
 
     def _remedy(self, name: str, si_unit: str | None) -> str:
         # A length is never meant for an angle.

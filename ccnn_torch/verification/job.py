@@ -44,6 +44,8 @@ from ccnn_torch.records.read_table import mapped
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.results.base import Length
 from ccnn_torch.report.results.verify import Error, JointError, Promised, Size, VerifyResults
+from ccnn_torch.spelling import nearest
+from ccnn_torch.units import split_header
 from ccnn_torch.verification.page import verify_text
 from ccnn_torch.verification.promise import configurations, paired_gain, promise_of, promised, repeated
 
@@ -147,6 +149,23 @@ def mapped_columns(model: LoadedModel, records: Any, machine: Mechanism) -> tupl
     counted = read_joint_map(model.joint_map, machine.joints, model.columns)
     shown = counted is not None and counted.is_in(table.names, mapped(table, columns))
     return columns, model.joint_map if shown else {}
+
+
+def missing_of(model: LoadedModel, records: Records) -> list[str]:
+    """Sentences on what was not measured: parts of rows, and coordinates of the model's pose that no column has."""
+    units = {c.name: c.unit for c in records.pose_coordinates}
+    headers = {split_header(target)[0]: split_header(key)[0] for key, target in model.columns.items()}
+    notes = records.missing
+    for c in model.pose:
+        header = headers.get(c.name, "")
+        # Where positions alone were measured, nobody misses the orientation.
+        if c.name in units or not (header or c.unit in units.values()):
+            continue
+        near = nearest(header, [*records.columns])
+        called = f" ('{header}' in the model's records)" if header else ""
+        meant = f"; if column '{near}' is meant, rename it to '{header}'" if near else ""
+        notes.append(f"{c.name}{called} is not among these rows, which are judged by {', '.join(units)} alone{meant}.")
+    return notes
 
 
 def predict(model: LoadedModel, machine: Mechanism, records: Records, compensated: bool) -> Rows:
@@ -379,7 +398,7 @@ def verify_model(
         # The first error has to fall at 95 %.
         first, last = (getattr(error, results.kinds[0]) for error in (before, after))
         results.kept = paired_gain(first, last, groups)
-    results.notes += loaded.missing
+    results.notes += missing_of(model, loaded)
     if held := int((~judged).sum()):
         results.notes.append(
             f"{count_text(held, 'row')} next to a singular pose, where the model holds its way back to the nearest "

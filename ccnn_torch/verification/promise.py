@@ -163,12 +163,17 @@ def _spread(values: Tensor, groups: Tensor) -> float:
 
 
 def promise_of(model: LoadedModel) -> dict[str, Any] | None:
-    """The card's promise, or that of the identified.json beside an identified.yaml, which no signature covers."""
+    """The card's promise, that of a diagnosis.json, or that of the identified.json beside an identified.yaml, which no
+    signature covers."""
     if model.machine is None:
         metrics = model.card.get("metrics")
         found = metrics.get("promise") if isinstance(metrics, dict) else None
         return found if isinstance(found, dict) else None
-    path = Path(model.path).with_name("identified.json")
+    path = Path(model.path)
+    if len(model.machine.joints):
+        found = read_json(path).get("promise")
+        return found if isinstance(found, dict) else None
+    path = path.with_name("identified.json")
     if model.signed or not path.is_file():
         return None
     results = read_json(path)

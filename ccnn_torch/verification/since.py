@@ -20,7 +20,7 @@ from torch import Tensor
 from ccnn_torch.compensation import LoadedModel
 from ccnn_torch.diagnosis.candidates.atom import Atom, scaled_signature
 from ccnn_torch.diagnosis.residual.whitening import moving_channels, without_fitted
-from ccnn_torch.display import count_text, display_unit, with_unit
+from ccnn_torch.display import count_text, display_unit, number_text, with_unit
 from ccnn_torch.effects import (
     Coefficient,
     Situation,
@@ -44,7 +44,7 @@ from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.mechanisms.frames.partial import completed
 from ccnn_torch.numerics.designs import Candidates
 from ccnn_torch.report.results.verify import Change, ChangedNumber, Gap, NextPose, SinceResults, Told
-from ccnn_torch.verification.job import Rows, can_be_moved, fit_motion, motion_text, new_rows, predict
+from ccnn_torch.verification.job import Rows, can_be_moved, fit_motion, missing_of, motion_text, new_rows, predict
 from ccnn_torch.verification.promise import configurations, promise_of
 
 _T = TypeVar("_T")
@@ -134,7 +134,7 @@ def what_changed(
     atoms = _atoms(rows.situation, _may_change(model, rows.situation.mechanism))
     x = [a.columns[:, rows.channels] * rows.scale[..., None] for a in atoms]
     y = rows.residual * rows.scale
-    notes = list(loaded.missing)
+    notes = missing_of(model, loaded)
     if bool(rows.moved.any()):
         # What a motion of the device does, too, is not seen any more.
         frame = next(k for k, a in enumerate(atoms) if a.name == Frame.name)
@@ -470,8 +470,14 @@ def since_text(results: SinceResults) -> str:
 
 def _said(one: Told) -> str:
     instead = f" (or {' or '.join(one.instead)})" if one.instead else ""
-    if len(one.numbers) > 1:
-        return f"{one.text}{instead}"
-    number = one.numbers[0]
-    scale, unit = display_unit(number.unit, abs(number.value))
-    return f"{one.text} by {number.value / scale:+.3g} ± {1.96 * number.sd / scale:.2g} {unit}{instead}"
+    clear = [number for number in one.numbers if abs(number.value) > 1.96 * number.sd] or one.numbers
+    sizes = []
+    for number in clear:
+        scale, unit = display_unit(number.unit, abs(number.value))
+        sizes.append(f"{number.value / scale:+.3g} ± {number_text(1.96 * number.sd / scale, 2)} {unit}")
+    if len(one.numbers) == 1:
+        return f"{one.text} by {sizes[0]}{instead}"
+    named = ", ".join(f"{number.name} {size}" for number, size in zip(clear, sizes, strict=True))
+    rest = len(one.numbers) - len(clear)
+    more = f"; {rest} more {'is' if rest == 1 else 'are'} not clear of 0" if rest else ""
+    return f"{one.text} ({named}{more}){instead}"

@@ -155,3 +155,13 @@ def test_what_bends_and_gives_shows_in_wires_as_it_moves_the_hook(tmp_path: Path
             expected = (far[0] - far[1]) / (2 * step)
             found = _columns(effect, seen)[label][:, 0]
             torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7 * float(moved.abs().max()), msg=label)
+
+
+def test_a_part_has_the_numbers_of_its_machine_and_not_those_of_the_drawing() -> None:
+    """Rows of y and z alone were off by millimetres of a machine whose base frame had been fitted."""
+    framed = load_mechanism("framed", mechanism="delta", base=True)
+    fitted = framed.with_nominal(framed.nominal + 1e-3)
+    joints = framed.sample_joints(4, torch.Generator().manual_seed(0))
+    part = Partial(fitted, ["y", "z"])
+    torch.testing.assert_close(part.nominal, fitted.nominal, rtol=0, atol=0)
+    torch.testing.assert_close(part.forward_kinematics(joints, part.nominal), part.forward_kinematics(joints))

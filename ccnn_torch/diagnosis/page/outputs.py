@@ -24,12 +24,13 @@ from ccnn_torch.diagnosis.verdict.text import noise_text
 from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Instrument, Mechanism, SerialArm
+from ccnn_torch.mechanisms import Instrument, Mechanism, PoseError, Seen, SerialArm
 from ccnn_torch.mechanisms.drawn import drawn
 from ccnn_torch.mechanisms.mechanism_file import write_machine
 from ccnn_torch.mechanisms.pose import CHANNELS
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
+from ccnn_torch.verification.promise import configurations, of_whole, promise_block
 
 
 def write_result(folder: Path, diagnosis: Said) -> Path:
@@ -41,6 +42,35 @@ def write_result(folder: Path, diagnosis: Said) -> Path:
     path = folder / RESULT
     write_json(path, DiagnosisResults.model_validate(diagnosis.to_json()))
     return path
+
+
+def promise_of_verdict(diagnosis: Diagnosis, seed: int) -> dict[str, Any] | None:
+    """The entry `promise`: what the rows under fits to others promise for new ones.
+
+    None where the machine of the file lacks an effect of the verdict, or new rows would have another frame.
+
+    Args:
+        diagnosis: with its analysis.
+        seed: of the folds, as in the diagnosis.
+    """
+    analysis, situation = diagnosis.analysis, diagnosis.analysis.situation
+    mechanism = situation.mechanism
+    held = {one["name"] for one in (diagnosis.machine or {}).get("effects", [])}
+    lacking = any(a.effect.kind != "parameters" and a.effect.name not in held for a in diagnosis.acting)
+    if diagnosis.machine is None or lacking or mechanism.grouped or isinstance(mechanism, Seen):
+        return None
+    keep, residual = analysis.whitening.keep(), pose_residual(situation, analysis.measured)
+    left = _remainder(analysis, residual, diagnosis.judgement.found.members, seed)
+    angles = torch.tensor([c.unit == "rad" for c in mechanism.channels])
+    before, after = (
+        of_whole(
+            PoseError(e[:, ~angles].norm(dim=-1), e[:, angles].norm(dim=-1) if bool(angles.any()) else None),
+            analysis.measured[keep],
+            mechanism.pose,
+        )
+        for e in (residual[keep], left[keep])
+    )
+    return promise_block(before, after, configurations(situation.joints[keep], mechanism.joints))
 
 
 def write_check(folder: Path, check: Check) -> Path:

@@ -23,7 +23,7 @@ _FAR_BETTER = 0.2
 # Frames are fitted with another count where closed forms, at a hundredth of the cost, halve what is left.
 _WORTH_A_FIT = 0.5
 # More rows than this share are not outliers: another model describes them.
-_OUTLIERS = 0.25
+OUTLIERS = 0.25
 
 
 def judge_frames(
@@ -73,7 +73,7 @@ def judge_frames(
     elif turned is not None and turned > _ANGLE:
         wrong = f"orientations by more than {1e3 * turned:.3g} mrad (plausible: {1e3 * _ANGLE:.0f} mrad)"
     wrong = wrong and f"half of the measured {wrong}"
-    if not wrong and share > _OUTLIERS:
+    if not wrong and share > OUTLIERS:
         wrong = (
             f"{share:.0%} of the measured poses by far more than the others, up to {1e3 * float(length.max()):.3g} mm"
         )

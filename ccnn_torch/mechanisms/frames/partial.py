@@ -72,6 +72,7 @@ class Seen(Around, ABC):
             home_pose=home,
             home_joints=inner.home_joints.tolist(),
         )
+        self.nominal[: len(inner.nominal)].copy_(inner.nominal)
         self.mechanism, self.takes, self.gears, self.motors = inner, inner.takes, inner.gears, inner.motors
         self.platform_mass = inner.platform_mass
 

@@ -84,8 +84,8 @@ def interval_text(spread: Spread | None, scale: float = 1.0, digits: int = 4) ->
     return text if known == len(spread.values) else f"{text} ({known} of {len(spread.values)})"
 
 
-def removed_percent(before: Spread, after: Spread) -> float | None:
+def removed_percent(before: Spread | None, after: Spread | None) -> float | None:
     """Share of an error that was removed, from the medians [percent]; None where the error before is unknown or 0."""
-    if not before.median or after.median is None:
+    if before is None or after is None or not before.median or after.median is None:
         return None
     return 100.0 * (1.0 - after.median / before.median)

@@ -7,6 +7,7 @@ from typing import Any, Generic, Literal, TypeVar
 from pydantic import Field
 
 from ccnn_torch.report.results.base import Ends, Length, Number, Result
+from ccnn_torch.report.results.identified import Promise
 
 _Share = TypeVar("_Share")
 _Region = TypeVar("_Region")
@@ -270,3 +271,6 @@ class DiagnosisResults(Result):
     shift [m] and rotation vector [rad], in the frame before. Errors of link 1's place and of the flange hide in them"""
     machine: FoundMachine | None = None
     """the machine with these effects, fitted together to all rows, as a compensator takes it"""
+    promise: Promise | None = None
+    """what the rows promise for new ones (ccnn verify), each by fits to others; null without a machine, or where it
+    lacks an effect of the verdict"""

@@ -116,6 +116,9 @@ class WithoutOutliers(Result):
     """held-out rows that are far from every model, in the repeat that has most"""
     before: Spread
     after: Spread
+    explained: Spread | None = None
+    geometry: Spread | None = None
+    effects: Spread | None = None
 
 
 class PoseFigures(Result):
@@ -133,6 +136,12 @@ class PoseFigures(Result):
     """what no joint deviation explains"""
     without_outliers: WithoutOutliers | None = None
     """RMS on the other rows, where some are gross outliers"""
+
+    def led(self, name: str) -> Spread | None:
+        """The RMS that a sentence leads with, of `before`, `after` or a part: without gross outliers."""
+        block: RmsMax | None = self[name]
+        others = None if self.without_outliers is None else self.without_outliers[name]
+        return others or (None if block is None else block.rms)
 
 
 class Energy(PoseFigures):
