@@ -180,7 +180,7 @@ def export(
     sd: Annotated[bool, typer.Option("--sd", help="Add a function for the deviation's standard deviation.")] = False,
     current: Annotated[
         Path | None,
-        typer.Option(help="Your file of the stack, which is read: printer.cfg, calibration.json, a PAL robot's URDF."),
+        typer.Option(help="Your file of the stack, which is read: printer.cfg, calibration.json, a robot's URDF."),
     ] = None,
     public_key: PublicKey = None,
     allow_code: AllowCode = False,
@@ -193,8 +193,8 @@ def export(
 
     st: compensator.st, selftest.st and a README.md for TwinCAT and CODESYS (IEC 61131-3 Structured Text).
 
-    linuxcnc: ccnnkins.comp, the machine's kinematics with the compensation around them, for halcompile; of an
-    identified.yaml the kinematics with the identified parameters.
+    linuxcnc: ccnnkins.comp, the machine's kinematics with the compensation around them, for halcompile; of a
+    geometry alone the kinematics with the identified parameters.
 
     onnx: model.onnx with master and card, and controller.onnx with the command alone.
 
@@ -204,7 +204,8 @@ def export(
     table, beckhoff: the deviation over a grid, tables of single axes (LinuxCNC, Heidenhain, Beckhoff), the grid of
     TF5280 and a mesh where they suffice, and how far off each is.
 
-    urdf, mjcf: an arm with its identified links as URDF, MuJoCo model and DH table.
+    urdf, mjcf: an arm with its identified links as URDF, MuJoCo model and DH table; --current robot.urdf: your own URDF
+    with other origins of its joints, all else as it is.
 
     ur: kinematics.yaml of a UR arm for ur_description and ur_robot_driver; --current keeps its hash.
 
@@ -216,7 +217,8 @@ def export(
 
     linuxcnc_hal: kinematics.hal, the numbers of genhexkins (hexapods) or genserkins (arms of six turning joints).
 
-    Files of numbers hold the geometry alone: the screen and their README.md say what they leave.
+    Files of numbers hold the geometry alone, that which comes nearest to the whole model: the screen and their
+    README.md say what they leave.
 
     Source code returns the same codes: 0 exact; 1 outside the domain, or where the model broke its limit; 2 where an
     input is not finite: then command = joints, with the middle of the domain for what is no number and its edge for

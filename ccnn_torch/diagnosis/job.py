@@ -128,7 +128,7 @@ def _complete(config: DiagnoseConfig, folder: Path, said: Diagnosis, quiet: bool
             said = with_network(said, config.seed, lambda share: tell("network on the remainder", share))
         tell("figures and report")
         about = head_of(config, folder, config.records, compensate_lines(config, said, folder / RESULT))
-        write_diagnosis(folder, said, about, config.seed)
+        write_diagnosis(folder, said, about, config.seed, str(config.mechanism))
     return ["report.html"]
 
 

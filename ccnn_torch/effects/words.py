@@ -29,8 +29,8 @@ _WORDS = {
     "geometry": Words(
         "an error of the geometry",
         "geometry error",
-        "The values were fitted together, and single ones do not correct the machine: all are in corrected.yaml (of an "
-        "arm also corrected.urdf), or else in diagnosis.json.",
+        "The values were fitted together, and single ones do not correct the machine: all are in corrected.yaml, or "
+        "else in diagnosis.json.",
         "Mounting and lengths of {where}, of sliding axes their squareness, where a value is off by more than its "
         "tolerance.",
     ),

@@ -223,7 +223,7 @@ def write_outputs(found: Identification, folder: Path) -> None:
     maps = config.columns, config.joint_map, {j.name: pair for j, pair in zip(machine.joints, ends, strict=False)}
     if bool(next(iter(found.outcomes.values())).converged[0]):
         # A machine at the values where a search stopped is none that commands may come from.
-        write_machine(machine, found.nominal(), folder, "identified", *maps)
+        write_machine(machine, found.nominal(), folder, "identified", *maps, source=str(config.mechanism))
     if found.config.save_report:
         write_identified_report(folder, results)
     write_json(folder / RESULTS, IdentifiedResults.model_validate(results))

@@ -265,10 +265,10 @@ def read_urdf(
     axes: list[list[float]] = []
     types: list[str] = []
     limits: list[list[float]] = []
-    fixed = _IDENTITY
+    fixed = IDENTITY
     for joint in chain:
         name, kind = joint.get("name", "?"), joint.get("type", "")
-        fixed = compose(fixed, _origin(path, joint))
+        fixed = compose(fixed, origin_of(path, joint))
         body = inertials.get(link_of(path, joint, "child"))
         if kind == "fixed":
             if bodies and body is not None:
@@ -283,7 +283,7 @@ def read_urdf(
         axes.append(axis_of(path, joint))
         types.append(_MOVING[kind])
         limits.append(_limit(path, joint, kind))
-        fixed = _IDENTITY
+        fixed = IDENTITY
         bodies.append([] if body is None else [_body(path, joint, body, fixed)])
     if not links:
         raise InputError(f"{path}: the chain has no joint that moves; give base=LINK and tip=LINK")
@@ -310,9 +310,9 @@ def urdf_joints(path: str) -> list[str]:
     return [joint.get("name", "?") for joint in chain if joint.get("type") != "fixed"]
 
 
-_Transform = tuple[Tensor, Tensor]
+Transform = tuple[Tensor, Tensor]
 _Body = tuple[float, Tensor]
-_IDENTITY: _Transform = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+IDENTITY: Transform = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
 
 def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[Element]:
@@ -372,7 +372,7 @@ def link_of(path: str, joint: Element, role: str) -> str:
     return name
 
 
-def _body(path: str, joint: Element, inertial: Element, held: _Transform) -> _Body:
+def _body(path: str, joint: Element, inertial: Element, held: Transform) -> _Body:
     """Mass [kg] and its centre [m] in the frame of the link that moves, which holds the joint's child so."""
     name, element = f"link '{link_of(path, joint, 'child')}'", inertial.find("mass")
     text = "" if element is None else element.get("value", "")
@@ -408,7 +408,8 @@ def triple(path: str, joint: Element, tag: str, attribute: str, default: str, na
     return torch.tensor(values, dtype=torch.float64)
 
 
-def _origin(path: str, joint: Element) -> _Transform:
+def origin_of(path: str, joint: Element) -> Transform:
+    """Rotation and place [m] of the origin of a joint of a URDF."""
     roll_pitch_yaw = triple(path, joint, "origin", "rpy", "0 0 0")
     return euler_zyx_to_matrix(roll_pitch_yaw.flip(-1)), triple(path, joint, "origin", "xyz", "0 0 0")
 
@@ -438,6 +439,6 @@ def _limit(path: str, joint: Element, kind: str) -> list[float]:
     return [low, high]
 
 
-def _link_row(transform: _Transform) -> list[float]:
+def _link_row(transform: Transform) -> list[float]:
     """x, y, z, roll, pitch, yaw."""
     return [*transform[1].tolist(), *matrix_to_euler_zyx(transform[0]).flip(-1).tolist()]

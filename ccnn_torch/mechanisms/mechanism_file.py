@@ -12,24 +12,27 @@ measured: {q1: [0.2, 1.4]}   # lowest and highest joints of its records [SI]
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
+from xml.parsers import expat
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.read import CONFIG_LIMIT, read_text
+from ccnn_torch.files.read import CONFIG_LIMIT, read_bytes, read_text, read_xml
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
+from ccnn_torch.mechanisms.dh_file import IDENTITY, URDF_LIMIT, Transform, axis_of, link_of, origin_of, triple
 from ccnn_torch.mechanisms.machines.links import compose, transform_of
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
-from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector
+from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, nearest_euler
 from ccnn_torch.units import LARGEST
 
 _FORM = "a mechanism file has mechanism, keys and parameters: {NAME: {value: …, nominal: …, unit: …}}"
@@ -167,7 +170,7 @@ def dh_text(arm: SerialArm) -> str:
 
 
 def urdf_text(arm: SerialArm) -> str:
-    """The arm's nominal parameters as a URDF chain `base_link` … `tool`, base and tool frame as fixed joints.
+    """The arm's nominal parameters as a URDF chain `measurement`, `base_link` … `tool`, frames as fixed joints.
 
     Each link's fixed transform becomes the origin of the joint behind it (standard DH: the motion comes first) or of
     its own joint (modified DH, URDF). Roll, pitch and yaw are the file's form of a rotation, so a number may differ
@@ -175,11 +178,11 @@ def urdf_text(arm: SerialArm) -> str:
     a calibration does not know and which are written as 0.
     """
     base, origins, last = chain_of(arm)
-    origins[0] = compose(base, origins[0])
     root = Element("robot", name=visible(arm.name))
     names = ["base_link", *(f"link{i + 1}" for i in range(len(origins))), "tool"]
-    for name in names:
+    for name in ("measurement", *names):
         SubElement(root, "link", name=name)
+    _joint(root, "base_frame", "fixed", "measurement", names[0], base)
     for i, origin in enumerate(origins):
         kind = "revolute" if bool(arm.revolute[i]) else "prismatic"
         joint = _joint(root, arm.joints[i].name, kind, names[i], names[i + 1], origin)
@@ -189,6 +192,150 @@ def urdf_text(arm: SerialArm) -> str:
     _joint(root, "tool_frame", "fixed", names[-2], names[-1], last)
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def patched_urdf(path: str, before: SerialArm, after: SerialArm) -> str:
+    """A user's own URDF with corrected origins of an arm's joints; all else stays as it is, byte by byte.
+
+    What an origin was stands in a comment behind it, and where the base and the measured tool are at the end: these
+    are no part of a robot's own file.
+
+    Args:
+        path: the URDF.
+        before: the arm of its numbers.
+        after: the arm of the numbers wanted.
+
+    Raises:
+        InputError: as `moved_origins`, or the file is not UTF-8, or names two joints alike.
+    """
+    moved = {name: (was, now) for name, was, now in moved_origins(path, before, after)}
+    content = read_bytes(path, URDF_LIMIT)
+    parser, stack, begun, origins = (
+        expat.ParserCreate(),
+        list[tuple[str, str]](),
+        list[tuple[str, int]](),
+        dict[str, int](),
+    )
+
+    def opened(tag: str, attributes: Mapping[str, str]) -> None:
+        stack.append((tag, attributes.get("name", "")))
+        if tag == "joint" and len(stack) == 2 and stack[1][1] in moved:
+            begun.append((stack[1][1], parser.CurrentByteIndex))
+        if tag == "origin" and len(stack) == 3 and stack[1][0] == "joint":
+            origins[stack[1][1]] = parser.CurrentByteIndex
+
+    parser.StartElementHandler = opened
+    parser.EndElementHandler = lambda _: stack.pop()
+    parser.Parse(content, True)
+    if len(begun) > len(moved):
+        raise InputError(f"{path}: has {len(begun)} joints of the names {', '.join(moved)}; give each its own name")
+    edits = []
+    for name, at in begun:
+        was, now = moved[name]
+        if max(abs(a - b) for a, b in zip(was, now, strict=True)) <= _SAME:
+            continue
+        tag = _TAG.match(content, origins.get(name, at))
+        assert tag is not None
+        there = name in origins
+        end = b">" if there and not tag[0].endswith(b"/>") else b"/>"
+        told = (" ".join(map(repr, part)) for part in (now[:3], now[3:], was[:3], was[3:]))
+        made = '<origin xyz="{}" rpy="{}"%s<!-- corrected by ccnn_torch; was xyz="{}" rpy="{}" -->'.format(*told)
+        edits.append((tag.start() if there else tag.end(), tag.end(), made.encode() % end))
+    base, _, tool = chain_of(after)
+    places = (f"xyz {_numbers(at)} rpy {_numbers(_angles(turn))}" for turn, at in (base, tool))
+    base_said, tool_said = places
+    said = (
+        f"<!-- ccnn_torch corrected origins of joints. Not in this file: the base in the frame of the measurement, "
+        f"{base_said}; the measured tool behind the last of these joints, {tool_said}. -->\n"
+    )
+    last = content.rindex(b"</")
+    edits.append((last, last, said.encode()))
+    for start, stop, new in sorted(edits, reverse=True):
+        content = content[:start] + new + content[stop:]
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: the file is not UTF-8 text; save it as UTF-8") from None
+
+
+def _urdf_from(source: str, before: SerialArm, after: SerialArm) -> str:
+    """`patched_urdf` where the source is a URDF; where it cannot be used, `urdf_text` that says why."""
+    if not source.lower().endswith(".urdf"):
+        return urdf_text(after)
+    try:
+        return patched_urdf(source, before, after)
+    except InputError as reason:
+        return urdf_text(after) + f"<!-- A chain of its own: {visible(str(reason)).replace('--', '- -')} -->\n"
+
+
+_TAG = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""")
+# Differences of origins that are rounding [m or rad].
+_SAME = 1e-12
+
+
+def moved_origins(path: str, before: SerialArm, after: SerialArm) -> list[tuple[str, list[float], list[float]]]:
+    """Of the joints of a URDF that are those of an arm the names, and x, y, z, roll, pitch, yaw before and after.
+
+    Fixed joints before a joint stay, so that its own origin takes what changed.
+
+    Raises:
+        InputError: as `joints_of`.
+    """
+    found = []
+    origins = zip(joints_of(path, before), chain_of(before)[1], chain_of(after)[1], strict=True)
+    for joint, was, now in origins:
+        own = origin_of(path, joint)
+        turn, at = compose(compose(own, _inverse(was)), now)
+        angles = triple(path, joint, "origin", "rpy", "0 0 0").tolist()
+        told = [*at.tolist(), *nearest_euler(_angles(turn).tolist(), angles)]
+        found.append((joint.get("name", "?"), [*own[1].tolist(), *angles], told))
+    return found
+
+
+def joints_of(path: str, arm: SerialArm) -> list[Element]:
+    """The joints of a URDF that are those of an arm, by their axes and origins.
+
+    Raises:
+        InputError: the file cannot be read, or has no such joints.
+    """
+    root = read_xml(path, URDF_LIMIT, "give the URDF of the robot")
+    above = {link_of(path, joint, "child"): joint for joint in root.findall("joint")}
+    parents = {link_of(path, joint, "parent") for joint in above.values()}
+    wanted, n = chain_of(arm)[1], len(arm.joints)
+    for link in [link for link in above if link not in parents]:
+        joints: list[Element] = []
+        while link in above and len(joints) <= len(above):
+            joints.append(above[link])
+            link = link_of(path, above[link], "parent")
+        moving, merged = [], []
+        fixed = IDENTITY
+        for joint in joints[::-1]:
+            fixed = compose(fixed, origin_of(path, joint))
+            if joint.get("type") in ("revolute", "continuous", "prismatic"):
+                moving.append(joint)
+                merged.append(fixed)
+                fixed = IDENTITY
+        for k in range(len(moving) - n + 1):
+            same = [_apart(a, b) < _EQUAL for a, b in zip(merged[k + 1 : k + n], wanted[1:], strict=True)]
+            axes = torch.tensor([axis_of(path, joint) for joint in moving[k : k + n]], dtype=torch.float64)
+            if all(same) and (axes - arm.axes * arm.signs[:, None]).abs().max() < _EQUAL:
+                return moving[k : k + n]
+    raise InputError(
+        f"{path}: has no {n} joints one after the other with the axes and origins of '{visible(arm.name)}'; give the "
+        "URDF that the records were identified with"
+    )
+
+
+# Differences of numbers that are the same ones, written by other programs [m, rad].
+_EQUAL = 1e-6
+
+
+def _apart(first: Transform, second: Transform) -> float:
+    return max(float((a - b).abs().max()) for a, b in zip(first, second, strict=True))
+
+
+def _inverse(frame: Transform) -> Transform:
+    return frame[0].mT, -(frame[0].mT @ frame[1])
 
 
 def mjcf_text(arm: SerialArm) -> str:
@@ -213,10 +360,7 @@ def mjcf_text(arm: SerialArm) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-_Frame = tuple[Tensor, Tensor]
-
-
-def chain_of(arm: SerialArm) -> tuple[_Frame, list[_Frame], _Frame]:
+def chain_of(arm: SerialArm) -> tuple[Transform, list[Transform], Transform]:
     """Base; fixed transforms before each joint's motion; and that behind the last, tool included."""
     n = len(arm.joints)
     values = arm.nominal
@@ -229,7 +373,7 @@ def chain_of(arm: SerialArm) -> tuple[_Frame, list[_Frame], _Frame]:
     return base, [none, *fixed[:-1]], compose(fixed[-1], tool)
 
 
-def _placed(frame: _Frame) -> dict[str, str]:
+def _placed(frame: Transform) -> dict[str, str]:
     turn = matrix_to_rotation_vector(frame[0])
     half = torch.linalg.vector_norm(turn) / 2
     # sin(x) / x, also at 0.
@@ -241,9 +385,13 @@ def _joint(root: Element, name: str, kind: str, parent: str, child: str, origin:
     joint = SubElement(root, "joint", name=name, type=kind)
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
-    roll_pitch_yaw = matrix_to_euler_zyx(origin[0]).flip(-1)
-    SubElement(joint, "origin", xyz=_numbers(origin[1]), rpy=_numbers(roll_pitch_yaw))
+    SubElement(joint, "origin", xyz=_numbers(origin[1]), rpy=_numbers(_angles(origin[0])))
     return joint
+
+
+def _angles(turn: Tensor) -> Tensor:
+    """Roll, pitch and yaw [rad]."""
+    return matrix_to_euler_zyx(turn).flip(-1)
 
 
 def _numbers(values: Tensor) -> str:
@@ -258,6 +406,8 @@ def write_machine(
     columns: Mapping[str, str] | None = None,
     joint_map: Mapping[str, str] | None = None,
     measured: Mapping[str, Sequence[float]] | None = None,
+    alone: SerialArm | None = None,
+    source: str = "",
 ) -> list[Path]:
     """Write `STEM.yaml`, of a serial arm also `STEM.urdf` and, where it is one of DH parameters, `STEM_dh.yaml`.
 
@@ -269,13 +419,18 @@ def write_machine(
         folder: where to.
         stem: of the files' names.
         columns, joint_map, measured: as of `mechanism_text`.
+        alone: what a URDF and a DH table hold, where the mechanism's numbers belong beside effects; else the mechanism.
+        source: what the mechanism was read from; a URDF is written again with other origins, see `patched_urdf`.
     """
     texts = {f"{stem}.yaml": mechanism_text(mechanism, nominal, columns, joint_map, measured)}
     # A URDF has no word for what a drive moves beside its joint, or too far.
     if isinstance(mechanism, SerialArm) and not mechanism.drives:
-        texts[f"{stem}.urdf"] = urdf_text(mechanism)
+        arm = alone or mechanism
+        before = mechanism.with_nominal(mechanism.nominal.new_tensor([nominal[p.name] for p in mechanism.geometry]))
+        assert isinstance(before, SerialArm)
+        texts[f"{stem}.urdf"] = _urdf_from(source, before, arm)
         if mechanism.convention != "urdf":
-            texts[f"{stem}_dh.yaml"] = dh_text(mechanism)
+            texts[f"{stem}_dh.yaml"] = dh_text(arm)
     for name, text in texts.items():
         write_whole(folder / name, text)
     return [folder / name for name in texts]

@@ -12,7 +12,7 @@ import torch
 from fitted import LIMITS, six_axis_arm
 from torch import Tensor
 
-from ccnn_torch import diagnose, load_mechanism, load_records
+from ccnn_torch import diagnose, export_model, load_mechanism, load_records
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.compensation.job import compensate_table
 from ccnn_torch.compensation.model_files.identified import model_of_machine
@@ -57,6 +57,11 @@ def test_its_commands_bring_the_machine_to_the_nominal_pose(found: Path) -> None
     torch.testing.assert_close(pose[exact], wanted[exact], rtol=0, atol=5e-7)
     with pytest.raises(InputError, match=r"needs the covariates .*direction1"):
         model(region.joints.numpy())
+
+
+def test_linuxcnc_has_what_acts_beside_the_geometry(found: Path, tmp_path: Path) -> None:
+    files = export_model(found, "linuxcnc", tmp_path)
+    assert "in_direction1" in files["ccnnkins.comp"].read_text()
 
 
 def test_it_says_that_rows_are_outside_what_was_measured(found: Path, tmp_path: Path) -> None:

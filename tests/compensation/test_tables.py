@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from kinds import masked
-from machines import compensated, known, small_network
+from machines import known, small_network
 from stand_ins import fields, tripod_compensator
 from torch import Tensor
 
@@ -211,7 +211,8 @@ def test_directions_that_are_known_only_together_are_not_told_apart() -> None:
 
 
 def test_identified_links_go_back_into_a_simulator(tmp_path: Path, cli: Cli) -> None:
-    made, about_arm = compensated("sliding arm"), known("sliding arm")
+    about_arm = known("sliding arm")
+    made = about_arm.compensator(0.0)
     arm, identified, joints = about_arm.mechanism, about_arm.identified, about_arm.joints
     assert isinstance(arm, SerialArm) and made.machine is not None
     about = fields() | {"mechanism": arm.describe()}

@@ -20,7 +20,7 @@ from ccnn_torch.diagnosis.residual.linearisation import remainder
 from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, pose_residual, reached
-from ccnn_torch.effects.found_machine import machine_of_block
+from ccnn_torch.effects.found_machine import found_block, machine_of_block
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.judge import scatter
 from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames, load_mechanism
@@ -93,6 +93,21 @@ def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_th
         corrected = load_mechanism(str(tmp_path / name))
         far = corrected.pose_error(pose, corrected.forward_kinematics(situation.joints)).position
         assert float(far.square().mean().sqrt()) < 1.1 * NOISE * 3**0.5, name
+    # Beside another cause a URDF, which holds none, gets the geometry that is nearest to both.
+    plain = replace(situation, parameters=None, covariates={})
+    sizes = torch.tensor([2e-3 if c.unit == "1" else 0.0 for c in make_effect("joint_gain").coefficients(plain)])
+    gain = Acting(make_effect("joint_gain"), sizes.new_zeros(0).double(), sizes.double())
+    real = load_mechanism(str(tmp_path / "corrected.yaml"))
+    whole = replace(plain, mechanism=real, gravity=default_gravity(real))
+    block = found_block(whole, real.nominal, [gain], {})
+    write_corrected(tmp_path, replace(found, content={**found.content, "machine": block}))
+    assert torch.equal(load_mechanism(str(tmp_path / "corrected.yaml")).nominal, real.nominal)
+    both = reached(whole, [gain])
+    yaml, urdf, table = (
+        real.pose_error(both, load_mechanism(str(tmp_path / name)).forward_kinematics(situation.joints)).position
+        for name in ("corrected.yaml", "corrected.urdf", "corrected_dh.yaml")
+    )
+    assert float(urdf.norm()) < 0.5 * float(yaml.norm()) and float(table.norm()) < 0.5 * float(yaml.norm())
 
 
 def _in_sockets(size: float = 1e-3) -> tuple[Situation, Tensor]:

@@ -1,5 +1,6 @@
 """The identified machine out again: our own file, DH file, URDF."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,14 @@ from mechanisms.catalogue import make
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
-from ccnn_torch.mechanisms.mechanism_file import dh_text, mechanism_text, read_mechanism_file, urdf_text
+from ccnn_torch.mechanisms.mechanism_file import (
+    dh_text,
+    mechanism_text,
+    patched_urdf,
+    read_mechanism_file,
+    urdf_text,
+    write_machine,
+)
 
 ARMS = ("ur10", "ur10_positions", "panda", "scara", "urdf")
 
@@ -101,3 +109,52 @@ def test_a_damaged_file_is_named(old: str, new: str, message: str, tmp_path: Pat
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=message):
         load_mechanism(str(path))
+
+
+OWN = """<?xml version="1.0"?>\r
+<!-- kept: <joint name="a"><origin xyz="9 9 9"/></joint> -->
+<robot name='cell'><material name="grey é"/>
+  <link name="base"/><link name="arm"><inertial><mass value="3.5"/><origin xyz="0 0 .1"/><inertia ixx="1" ixy="0"
+    ixz="0" iyy="1" iyz="0" izz="1"/></inertial><visual><origin xyz="0 0 .2"/></visual></link>
+  <link name="hand"/><link name="flange"/>
+  <joint name="a" type="revolute"><parent link="base"/><child link="arm"/>
+    <axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="150" velocity="3"/></joint>
+  <joint type="revolute" name='b'><parent link="arm"/><child link="hand"/><origin  rpy='0 1.5707963 0'
+    xyz = "0.3 0 0" ></origin><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="28" velocity="3"/></joint>
+  <joint name="end" type="fixed"><parent link="hand"/><child link="flange"/><origin xyz="0 0 .1"/></joint>
+  <transmission name="t"><joint name="a"/></transmission>
+</robot>
+"""
+
+
+def test_a_urdf_gets_other_origins_and_stays_as_it_is_otherwise(tmp_path: Path) -> None:
+    path = tmp_path / "own.urdf"
+    path.write_bytes(OWN.encode())
+    before = load_mechanism(str(path))
+    after = changed(before)
+    assert isinstance(before, SerialArm) and isinstance(after, SerialArm)
+    nominal = dict(zip((p.name for p in before.geometry), before.nominal.tolist(), strict=True))
+    write_machine(after, nominal, tmp_path, "identified", source=str(path))
+    text = (tmp_path / "identified.urdf").read_bytes().decode()
+    again = load_mechanism(str(tmp_path / "identified.urdf"))
+    assert isinstance(again, SerialArm)
+    # Base and tool are told, and no part of the file.
+    alone = after.nominal.clone()
+    alone[:6], alone[-6:] = before.nominal[:6], before.nominal[-6:]
+    joints = before.sample_joints(20, torch.Generator().manual_seed(1))
+    for ours, theirs in zip(before.forward_frame(joints, alone), again.forward_frame(joints), strict=True):
+        torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-12)
+    assert torch.equal(again.masses, before.masses) and len(before.masses) == 2
+    new = re.compile(r"""<origin xyz="[^"]*" rpy="[^"]*"/?><!-- corrected by ccnn_torch; was [^>]*-->""")
+    assert len(new.findall(text)) == 2
+    rest = re.sub(r"<!-- ccnn_torch corrected[^>]*-->\n", "", new.sub("", text))
+    assert rest == re.sub(r"""<origin  rpy='0 1.5707963 0'\s+xyz = "0.3 0 0" >""", "", OWN)
+    assert "the measurement, xyz " in text and 'was xyz="0.3 0.0 0.0" rpy="0.0 1.5707963 0.0"' in text
+    # A file that is the arm's no more is not touched, and the arm is written as a chain of its own.
+    path.write_text(OWN.replace("0.3 0 0", "0.4 0 0"))
+    write_machine(after, nominal, tmp_path, "identified", source=str(path))
+    text = (tmp_path / "identified.urdf").read_text()
+    assert '<link name="measurement" />' in text and "has no 2 joints one after the other" in text
+    path.write_text(OWN.replace('name="end" type="fixed"', 'name="b" type="fixed"'))
+    with pytest.raises(InputError, match="has 3 joints of the names a, b; give each its own name"):
+        patched_urdf(str(path), before, after)

@@ -86,8 +86,8 @@ class _Order:
             return f"{told}, SHA-256 {self.model.card['files'][file]}"
         return told
 
-    def mechanism(self) -> Mechanism:
-        if self.model.machine is not None:
+    def mechanism(self, corrected: bool) -> Mechanism:
+        if corrected and self.model.machine is not None:
             return self.model.machine.identified
         if "spec" not in self.model.facts["mechanism"]:
             raise ModelFileError(f"{self.path}: this target needs the machine's kinematics, which the model lacks")
@@ -95,8 +95,10 @@ class _Order:
 
 
 def _linuxcnc(order: _Order) -> dict[str, str]:
-    form = order.proven()[0] if order.model.machine is None else None
-    return print_linuxcnc(form, order.mechanism(), order.source())
+    machine = order.model.machine
+    # What acts beside a geometry no parameter of the kinematics holds.
+    form = order.proven()[0] if machine is None or machine.acting else None
+    return print_linuxcnc(form, order.mechanism(form is None), order.source())
 
 
 def _onnx(order: _Order) -> dict[str, bytes | str]:
@@ -146,7 +148,7 @@ TARGETS: dict[str, Callable[[_Order], Mapping[str, str | bytes]]] = {
     "linuxcnc_hal": _numbers(print_hal, "Kinematics"),
     "lerobot": _numbers(print_lerobot, "Calibration"),
 }
-CURRENT = ("ur", "pal", "lerobot", "klipper", "ros2_control")
+CURRENT = ("urdf", "mjcf", "ur", "pal", "lerobot", "klipper", "ros2_control")
 """Those that take names or numbers from the user's own file."""
 
 

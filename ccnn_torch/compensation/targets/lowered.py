@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.compensation.fit import ROWS, rows_of
+from ccnn_torch.compensation.machine import RULE, ForwardMachine
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.display import number_text, plain
 from ccnn_torch.effects import Situation, measured_pose, reached
@@ -22,6 +24,7 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.mechanism_file import chain_of
 from ccnn_torch.mechanisms.pose import frame_gap
+from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.rotations import (
     euler_zyx_to_matrix,
     matrix_to_euler_zyx,
@@ -49,19 +52,31 @@ class Found:
     @cached_property
     def nominal(self) -> Mechanism:
         """The machine as it was taken to be, in the frames that were identified."""
-        machine = self.model.mechanism(self.allow_code)
+        machine, found = self._known
         values = machine.nominal.clone()
         if isinstance(machine, SerialArm):
-            values[:6], values[-6:] = self._values[:6], self._values[-6:]
+            values[:6], values[-6:] = found[:6], found[-6:]
         return machine.with_nominal(values)
 
-    @property
+    @cached_property
     def identified(self) -> Mechanism:
-        return self.nominal.with_nominal(self._values)
+        """The geometry that alone comes nearest to the whole model: where nothing acts beside it, the identified one.
 
-    @property
-    def _values(self) -> Tensor:
-        return self.model.identified(self.allow_code).nominal
+        What was identified beside effects is of no use without them.
+        """
+        machine, values = self._known
+        start = machine.with_nominal(values)
+        return nearest_geometry(start, self.rows.joints, self.truth) if self.beside else start
+
+    @cached_property
+    def _known(self) -> tuple[Mechanism, Tensor]:
+        """The nominal machine, and all identified parameters."""
+        compensator = self.model.compensator if self.model.machine is None else None
+        made = None if compensator is None else compensator.machine
+        # Of an arm measured by positions alone it turns the tool as well.
+        if isinstance(made, ForwardMachine) and isinstance(made.mechanism, SerialArm):
+            return made.mechanism, made.identified
+        return self.model.mechanism(self.allow_code), self.model.identified(self.allow_code).nominal
 
     @cached_property
     def rows(self) -> Situation:
@@ -73,7 +88,7 @@ class Found:
             low, high = torch.from_numpy(self.model.region).unbind(-1)
             share = torch.rand(ROWS, len(low), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
             rows = Situation(self.nominal, low + (high - low) * share, {}, torch.zeros(3, dtype=torch.float64))
-        there = torch.isfinite(self.identified.forward_kinematics(rows.joints)).all(-1)
+        there = torch.isfinite(self.nominal.with_nominal(self._known[1]).forward_kinematics(rows.joints)).all(-1)
         given = {name: value[there] for name, value in rows.covariates.items()}
         return Situation(rows.mechanism, rows.joints[there], given, rows.gravity, travel=rows.travel)
 
@@ -88,7 +103,7 @@ class Found:
         centre = compensator.domain.centre[joints.shape[1] :].expand(len(joints), -1)
         given = centre if compensator.covariates else None
         with torch.no_grad():
-            if compensator.machine is not None and isinstance(self.identified, SerialArm):
+            if compensator.machine is not None and isinstance(self.nominal, SerialArm):
                 there = compensator.machine.reached(joints + compensator.learned(joints, given), centre)
                 turns = [] if there.rotation is None else [matrix_to_rotation_vector(there.rotation)]
                 return torch.cat([there.position, *turns], -1)
@@ -103,8 +118,11 @@ class Found:
         if self.model.machine is not None:
             return ", ".join(one.effect.name for one in self.model.machine.acting)
         compensator = self.model.compensator
-        effects = compensator is not None and compensator.machine is not None and compensator.machine.effects
-        return "effects, and what was learned" if effects else "what was learned"
+        if compensator is not None and compensator.machine is not None:
+            if compensator.machine.effects:
+                return "effects, and what was learned"
+            return "what was learned" if bool(compensator.limit.any()) else ""
+        return "what was learned"
 
 
 class Stack(NamedTuple):
@@ -122,27 +140,75 @@ class Stack(NamedTuple):
 
 
 def with_readme(stack: Stack, found: Found, title: str) -> tuple[dict[str, str], str]:
-    """Files with a README.md that says how to load them and what they leave; and that sentence."""
+    """Files with a README.md that says how to load them and what they leave; and that sentence.
+
+    Raises:
+        MethodFailedError: they leave more than the nominal machine does.
+    """
     said = left_over(stack.held, found)
+    if _weighed(stack.held, found) > _weighed(found.nominal, found) + _NONE:
+        raise MethodFailedError(
+            f"numbers of this form would leave {_told(rms(stack.held, found))}, more than the "
+            f"{_told(rms(found.nominal, found))} of the nominal machine; export c99, st or onnx, which hold the whole "
+            "model"
+        )
     return stack.files | {"README.md": f"# {title}\n\n{stack.load}\n\n{said}\n"}, said
+
+
+# What files lose by the digits that they write [m].
+_NONE = 1e-7
+
+
+def _weighed(machine: Mechanism, found: Found) -> float:
+    """`rms` of position and rotation as one length [m]."""
+    return math.hypot(*(w * e for w, e in zip((1.0, RULE.rotation_weight), rms(machine, found), strict=False)))
+
+
+# A parameter that moves by 10 mm or 10 mrad counts as much as 1 um of all rows: what these hardly see stays.
+_STAYS = 1e-4
+
+
+def nearest_geometry(start: Mechanism, joints: Tensor, poses: Tensor) -> Mechanism:
+    """The machine with the parameters by which it comes nearest to poses, position and weighted rotation.
+
+    Args:
+        start: with the parameters to begin from; those that are known stay.
+        joints: `s x n` [SI].
+        poses: `s x p` [SI]; rows that lack something (NaN) are left out.
+    """
+    fine = torch.isfinite(poses).all(-1)
+    joints, poses = joints[fine], poses[fine]
+    there = start.frame(poses)
+    free = torch.tensor([not p.held for p in start.geometry])
+    stays = _STAYS * math.sqrt(len(joints)) * torch.eye(int(free.sum()), dtype=torch.float64)
+
+    def both(change: Tensor) -> tuple[Tensor, Tensor]:
+        values = start.nominal.clone()
+        values[free] += change
+        here = start.frame(start.forward_kinematics(joints, values, poses))
+        slope = start.parameter_jacobian(joints, values, poses)[..., free]
+        slope[:, 3:] *= RULE.rotation_weight
+        gap = frame_gap(here, there, RULE.rotation_weight)
+        return torch.cat([gap.flatten(), stays @ change]), torch.cat([slope.flatten(0, 1), stays])
+
+    change = levenberg_marquardt(lambda c: both(c)[0], torch.zeros(len(stays), dtype=torch.float64), both=both).value
+    values = start.nominal.clone()
+    values[free] += change
+    return start.with_nominal(values)
 
 
 def left_over(held: Mechanism, found: Found) -> str:
     """How far the machine of a stack is from the real one over the domain, as a sentence."""
 
-    def told(values: Sequence[float]) -> str:
-        return " and ".join(f"{_short(1e6 * v)} {unit}" for v, unit in zip(values, ("um", "urad"), strict=False))
-
     most = [float(error.max()) for error in _errors(held, found)]
     said = (
-        f"Over {len(found.rows.joints)} random joints of the domain of the model this leaves {told(rms(held, found))} "
-        f"(RMS), {told(most)} at most, of {told(rms(found.nominal, found))} of the nominal machine."
+        f"Over {len(found.rows.joints)} random joints of the domain of the model this leaves {_told(rms(held, found))} "
+        f"(RMS), {_told(most)} at most, of {_told(rms(found.nominal, found))} of the nominal machine."
     )
-    # Offsets of the joints may leave less than the geometry does.
-    if found.beside and rms(found.identified, found)[0] <= 1.01 * rms(held, found)[0]:
+    if found.beside:
         said += (
-            f" Numbers of a geometry hold nothing of {plain(found.beside)}: the whole identified geometry leaves "
-            f"{told(rms(found.identified, found))}."
+            f" Numbers of a geometry hold nothing of {plain(found.beside)}; those that come nearest to the whole model "
+            f"leave {_told(rms(found.identified, found))}."
         )
     return said
 
@@ -155,6 +221,10 @@ def rms(machine: Mechanism, found: Found) -> list[float]:
 def _errors(machine: Mechanism, found: Found) -> list[Tensor]:
     pose = machine.forward_kinematics(found.rows.joints, guess=found.truth)
     return [e[torch.isfinite(e)] for e in machine.pose_error(pose, found.truth) if e is not None]
+
+
+def _told(values: Sequence[float]) -> str:
+    return " and ".join(f"{_short(1e6 * v)} {unit}" for v, unit in zip(values, ("um", "urad"), strict=False))
 
 
 def _short(value: float) -> str:

@@ -65,9 +65,9 @@ def print_klipper(found: Found) -> Stack:
         InputError: the printer.cfg that is there lacks an endstop.
     """
     inner, _ = inner_of(found.nominal)
-    real, seen = inner_of(found.identified)
-    if not isinstance(real, DeltaLinear):
+    if not isinstance(inner, DeltaLinear):
         raise MethodFailedError(f"klipper has kinematics of linear deltas, and '{inner.name}' is none; export table")
+    real, seen = inner_of(found.identified)
     was, now = (
         klipper_numbers(dict(zip((p.name for p in m.geometry), m.nominal.tolist(), strict=True))) for m in (inner, real)
     )
@@ -103,6 +103,13 @@ def print_hal(found: Found) -> Stack:
     Raises:
         MethodFailedError: the machine is neither.
     """
+    inner, _ = inner_of(found.nominal)
+    six = isinstance(inner, SerialArm) and len(inner.joints) == 6 and bool(inner.revolute.all())
+    if not six and not isinstance(inner, Stewart):
+        raise MethodFailedError(
+            f"genhexkins and genserkins are of hexapods and of arms of six turning joints, and '{inner.name}' is "
+            "neither; export linuxcnc, which has its own kinematics"
+        )
     machine, seen = inner_of(found.identified)
     if isinstance(machine, Stewart):
         legs = machine.nominal.reshape(6, 8)
@@ -124,12 +131,7 @@ def print_hal(found: Found) -> Stack:
             f"| `[JOINT_N]` | `SCALE` times | `HOME_OFFSET` [mm] |\n| --- | --- | --- |\n{rows}"
         )
         return Stack({"kinematics.hal": "\n".join(lines) + "\n"}, seen(rounded.flatten()), load)
-    if not isinstance(machine, SerialArm) or len(machine.joints) != 6 or not bool(machine.revolute.all()):
-        raise MethodFailedError(
-            f"genhexkins and genserkins are of hexapods and of arms of six turning joints, and '{machine.name}' is "
-            "neither; export linuxcnc, which has its own kinematics"
-        )
-    assert isinstance(found.nominal, SerialArm)
+    assert isinstance(machine, SerialArm) and isinstance(found.nominal, SerialArm)
     made, table = craig(chain(machine))
     before = craig(chain(found.nominal))[1]
     lines = []

@@ -6,7 +6,6 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -36,12 +35,18 @@ from ccnn_torch.compensation.targets.lowered import (
 from ccnn_torch.compensation.targets.printing import filled, wrapped
 from ccnn_torch.display import plain, visible
 from ccnn_torch.errors import InputError, MethodFailedError
-from ccnn_torch.files.read import CONFIG_LIMIT, parse_json, read_text, read_xml
+from ccnn_torch.files.read import CONFIG_LIMIT, parse_json, read_text
 from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms import SerialArm
-from ccnn_torch.mechanisms.dh_file import URDF_LIMIT, axis_of, link_of, triple
-from ccnn_torch.mechanisms.mechanism_file import chain_of, dh_text, mjcf_text, urdf_text
-from ccnn_torch.numerics.rotations import nearest_euler
+from ccnn_torch.mechanisms.mechanism_file import (
+    chain_of,
+    dh_text,
+    joints_of,
+    mjcf_text,
+    moved_origins,
+    patched_urdf,
+    urdf_text,
+)
 
 _HALF = math.pi / 2
 
@@ -52,19 +57,22 @@ def arm_in(found: Found) -> tuple[SerialArm, SerialArm]:
     Raises:
         MethodFailedError: the machine is no serial arm.
     """
-    nominal, identified = found.nominal, found.identified
-    if not isinstance(nominal, SerialArm) or not isinstance(identified, SerialArm):
+    nominal = found.nominal
+    if not isinstance(nominal, SerialArm):
         raise MethodFailedError(
             f"this format is of a serial arm, and '{nominal.name}' is none; its parameters are in identified.yaml"
         )
+    identified = found.identified
+    assert isinstance(identified, SerialArm)
     return nominal, identified
 
 
 def print_robot(found: Found) -> Stack:
-    """`robot.urdf`, `robot.xml` (MJCF), and `robot.yaml` where the arm has a DH table.
+    """`robot.urdf` (the user's own where it was given), `robot.xml` (MJCF), `robot.yaml` where the arm has a DH table.
 
     Raises:
         MethodFailedError: the model has no identified links, or its machine is no serial arm.
+        InputError: the URDF that was given is not that of the arm.
     """
     compensator = None if found.model.machine is not None else found.model.compensator
     if found.model.machine is None and (compensator is None or compensator.machine is None):
@@ -72,12 +80,24 @@ def print_robot(found: Found) -> Stack:
             "this model has no identified links of an arm to write; train with geometry=identify, or give the "
             "identified.yaml of ccnn identify"
         )
-    arm = arm_in(found)[1]
-    chain(arm)
-    texts = {"robot.urdf": urdf_text(arm), "robot.xml": mjcf_text(arm)}
-    texts |= {} if arm.convention == "urdf" else {"robot.yaml": dh_text(arm)}
-    load = (
-        "`robot.urdf` is a chain `base_link` to `tool`; `robot.xml` loads with "
+    nominal, arm = arm_in(found)
+    made = chain(arm)
+    own = found.current
+    texts = {"robot.urdf": urdf_text(arm) if own is None else patched_urdf(str(own), nominal, arm)}
+    texts |= {"robot.xml": mjcf_text(arm)} | ({} if arm.convention == "urdf" else {"robot.yaml": dh_text(arm)})
+    if own is None:
+        load = (
+            "`robot.urdf` is a chain `base_link` to `tool`, without masses, efforts and speeds; `--current robot.urdf` "
+            "writes yours with other origins instead."
+        )
+    else:
+        load = (
+            f"`robot.urdf` is `{plain(own.name)}` with other origins of the joints, and comments that say what they "
+            "were; all else is as it was."
+        )
+    load += (
+        f" The base of the robot in the frame of the measurement: {told_frame(made.base)}; the measured tool behind "
+        f"the last joint: {told_frame(matrix(*chain_of(arm)[2]))} [m, rad].\n\n`robot.xml` loads with "
         '`mujoco.MjModel.from_xml_path("robot.xml")`. Masses are 1 kg a link.'
     )
     return Stack(texts, arm, load)
@@ -190,14 +210,10 @@ def print_pal(found: Found) -> Stack:
     if found.current is None:
         raise InputError("--to pal names the joints of the robot: give its URDF as --current robot.urdf")
     path, (base, _, tool) = str(found.current), chain_of(identified)
-    joints = joints_of(path, nominal)
     lines = ["robot_state_publisher:", "  geometric_calibration:"]
-    for joint, before, after in zip(joints, _plain(nominal), _plain(identified), strict=True):
-        xyz, angles = _origin(path, joint)
-        moved = of_rpy(xyz, angles) @ np.linalg.inv(before) @ after
-        turned = nearest_euler(rpy(moved), angles)
-        deltas = [a - b for a, b in zip([*place_of(moved), *turned], [*xyz, *angles], strict=True)]
-        name = str(joint.get("name")).removesuffix("_joint")
+    for joint, before, after in moved_origins(path, nominal, identified):
+        deltas = [a - b for a, b in zip(after, before, strict=True)]
+        name = joint.removesuffix("_joint")
         if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
             raise InputError(
                 f"{path}: the name of joint '{visible(name)}' can be no key; ROS has letters, digits and _"
@@ -213,11 +229,6 @@ def print_pal(found: Found) -> Stack:
         "part."
     )
     return Stack({"master_calibration.yaml": "\n".join(lines) + "\n"}, identified, load)
-
-
-def _plain(arm: SerialArm) -> list[Array]:
-    """Transforms before each joint's motion, in the arm's own frames."""
-    return [matrix(*(part.numpy() for part in origin)) for origin in chain_of(arm)[1]]
 
 
 def print_lerobot(found: Found) -> Stack:
@@ -270,45 +281,6 @@ def print_lerobot(found: Found) -> Stack:
 
 # Of a motor of 12 bits, and the most that its register holds.
 _COUNTS, _MOST_COUNTS = 4096, 2047
-
-
-def joints_of(path: str, arm: SerialArm) -> list[Element]:
-    """The joints of a URDF that are those of the arm, by their axes and origins."""
-    root = read_xml(path, URDF_LIMIT, "give the URDF of the robot")
-    above = {link_of(path, joint, "child"): joint for joint in root.findall("joint")}
-    parents = {link_of(path, joint, "parent") for joint in above.values()}
-    wanted, n = _plain(arm), len(arm.joints)
-    for link in [link for link in above if link not in parents]:
-        joints: list[Element] = []
-        while link in above and len(joints) <= len(above):
-            joints.append(above[link])
-            link = link_of(path, above[link], "parent")
-        moving, merged, fixed = [], [], np.eye(4)
-        for joint in joints[::-1]:
-            fixed = fixed @ of_rpy(*_origin(path, joint))
-            if joint.get("type") in ("revolute", "continuous", "prismatic"):
-                moving.append(joint)
-                merged.append(fixed)
-                fixed = np.eye(4)
-        for k in range(len(moving) - n + 1):
-            same = [np.abs(a - b).max() < _EQUAL for a, b in zip(merged[k + 1 : k + n], wanted[1:], strict=True)]
-            axes = np.array([axis_of(path, joint) for joint in moving[k : k + n]])
-            if all(same) and np.abs(axes - (arm.axes * arm.signs[:, None]).numpy()).max() < _EQUAL:
-                return moving[k : k + n]
-    raise InputError(
-        f"{path}: has no {n} joints one after the other with the axes and origins of '{visible(arm.name)}'; give the "
-        "URDF that the records were identified with"
-    )
-
-
-# Differences of numbers that are the same ones, written by other programs [m, rad].
-_EQUAL = 1e-6
-
-
-def _origin(path: str, joint: Element) -> tuple[list[float], list[float]]:
-    """xyz and rpy as they are written."""
-    xyz, angles = (triple(path, joint, "origin", key, "0 0 0").tolist() for key in ("xyz", "rpy"))
-    return xyz, angles
 
 
 # What offsets may leave of the nominal machine's error, so that no controller is worth its while [1].

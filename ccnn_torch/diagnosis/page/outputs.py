@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.compensation.model_files.identified import model_of_machine
+from ccnn_torch.compensation.targets.lowered import Found, nearest_geometry
 from ccnn_torch.coordinates import Coordinate, is_temperature
 from ccnn_torch.diagnosis.checks.identifiable import Check
 from ccnn_torch.diagnosis.mount import machine_as_told
@@ -23,6 +25,7 @@ from ccnn_torch.diagnosis.shrink.held_out import held_out
 from ccnn_torch.diagnosis.verdict.text import noise_text
 from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units
+from ccnn_torch.effects.found_machine import machine_of_block
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Instrument, Mechanism, PoseError, Seen, SerialArm
 from ccnn_torch.mechanisms.drawn import drawn
@@ -80,7 +83,9 @@ def write_check(folder: Path, check: Check) -> Path:
     return path
 
 
-def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any] | None = None, seed: int = 0) -> Path:
+def write_diagnosis(
+    folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any] | None = None, seed: int = 0, source: str = ""
+) -> Path:
     """Write `diagnosis.json`, the arrays of its figures, the report, and of a named geometry the corrected machine.
 
     Args:
@@ -88,6 +93,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
         diagnosis: what to write.
         about: for the head of the report: what `About` holds.
         seed: of the diagnosis.
+        source: what the mechanism was read from.
 
     Raises:
         InputError: the folder cannot be written.
@@ -97,7 +103,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
         (folder / name).unlink(missing_ok=True)
     # A machine that no file describes has no corrected one, and the report does not wait for it.
     with suppress(InputError):
-        write_corrected(folder, diagnosis)
+        write_corrected(folder, diagnosis, source)
     arrays, labels = picture_arrays(diagnosis, seed)
     mechanism = diagnosis.analysis.situation.mechanism
     units = covariate_units(mechanism, diagnosis.analysis.situation.covariates) | {
@@ -112,8 +118,11 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
     return path
 
 
-def write_corrected(folder: Path, diagnosis: Diagnosis) -> None:
-    """The machine with the geometry that was named, all of its numbers in it and its frames fitted again."""
+def write_corrected(folder: Path, diagnosis: Diagnosis, source: str = "") -> None:
+    """The machine with the geometry that was named, all of its numbers in it and its frames fitted again.
+
+    Other causes act beside these numbers; a URDF and a DH table, which hold none, get the geometry nearest to all.
+    """
     mechanism, frames = diagnosis.analysis.situation.mechanism, diagnosis.analysis.situation.parameters
     named = [e["parameters"] for e in diagnosis.effects if e["name"] in diagnosis.verdict["effects"]]
     changed = any(b.get("nominal") is not None for parameters in named for b in parameters.values())
@@ -124,8 +133,26 @@ def write_corrected(folder: Path, diagnosis: Diagnosis) -> None:
     before = mechanism.nominal if frames is None else frames
     names = [p.name for p in mechanism.geometry]
     nominal = dict(zip(names, before.tolist(), strict=True))
-    maps = [(diagnosis.machine or {}).get(key) for key in ("columns", "joint_map")]
-    write_machine(machine, nominal, folder, Path(CORRECTED[0]).stem, *maps)
+    columns, joint_map = ((diagnosis.machine or {}).get(key) for key in ("columns", "joint_map"))
+    alone = _alone(diagnosis, machine)
+    write_machine(machine, nominal, folder, Path(CORRECTED[0]).stem, columns, joint_map, None, alone, source)
+
+
+def _alone(diagnosis: Diagnosis, machine: Mechanism) -> SerialArm | None:
+    """The arm whose geometry alone comes nearest to the machine with all that was named; None where nothing is beside.
+
+    An arm of which positions were measured is to turn its tool as that machine does.
+    """
+    if diagnosis.machine is None or not isinstance(machine, SerialArm) or machine.orientation == "direction":
+        return None
+    found = Found(model_of_machine(Path(RESULT), machine_of_block(diagnosis.machine, RESULT, allow_code=True)))
+    if not found.beside:
+        return None
+    whole = len(found.nominal.pose) == 6 and machine.recipe["keys"]["tool_offset"] is None
+    start = machine.with_orientation("rotation_vector") if whole else machine
+    nearest = nearest_geometry(start, found.rows.joints, found.truth[:, : len(start.pose)])
+    assert isinstance(nearest, SerialArm)
+    return nearest
 
 
 Column = tuple[str, str, Tensor]
