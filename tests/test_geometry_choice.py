@@ -11,7 +11,7 @@ from fitted import fitted_geometry
 from mechanisms.catalogue import make
 
 from ccnn_torch import calibrate
-from ccnn_torch.calibration.choice import Candidate, simplest_of_best
+from ccnn_torch.calibration.choice import Candidate, by_fold, simplest_of_best
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.prepare import Prepared, prepare
 from ccnn_torch.mechanisms import fit_frames, load_mechanism
@@ -113,6 +113,21 @@ def test_a_larger_model_has_to_be_better_by_two_standard_errors(left: tuple[floa
     before = torch.tensor([1.0, 1.0, 1.0, 1.0, 1e3], dtype=torch.float64)
     found = simplest_of_best({simple: before, larger: before * torch.tensor(left)}, "")
     assert found.identify and (found.method == "gp") is learner
+
+
+def test_rows_at_the_edge_that_err_under_all_candidates_do_not_decide() -> None:
+    """Of a real UR10 three rows of a hundred err by ten times the usual, and hid that a learner halves the others."""
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(100, 3, generator=generator, dtype=torch.float64).square().sum(-1)
+    effects, learner = Candidate(True, True, False), Candidate(True, False, True)
+    rows = {effects: (1e-4) ** 2 * noise, learner: (6e-5) ** 2 * noise}
+    for k in (7, 40, 90):
+        rows[effects][k], rows[learner][k] = 1e-6, 1.2e-6
+    held = torch.nn.functional.one_hot(torch.arange(100) % 5).mT.double()
+    errors = by_fold({c: r.expand(5, -1) for c, r in rows.items()}, held)
+    assert simplest_of_best(errors, "").effects is False
+    plain = {c: (r * held).sum(-1) / held.sum(-1) for c, r in rows.items()}
+    assert simplest_of_best(plain, "").effects is True
 
 
 def test_the_least_safe_model_has_to_beat_all_that_are_simpler() -> None:

@@ -31,6 +31,8 @@ _FOLDS = 5
 # Standard errors over the folds by which the logarithm of a larger model's error has to be better: one is exceeded by
 # chance in every fifth comparison of five folds, two in every seventeenth (Student's t).
 _ERRORS = 2.0
+# Usual errors of the best candidate, at which errors are bounded.
+_BOUND = 3.0
 # Rows that the comparison uses: enough to see what helps, few enough to take seconds.
 _MOST_ROWS = 600
 # The learner that is compared, and its settings: hyperparameters from few rows and steps, since there is a GP a fold.
@@ -154,10 +156,10 @@ def _errors(
     verdict: Verdict | None,
     learns: bool,
 ) -> dict[Candidate, Tensor]:
-    """Mean squared pose error of the held-out rows of each fold, `k` [m²], by candidate, the simplest first.
+    """Mean squared, bounded pose error of the held-out rows of each fold, `k` [m²], by candidate, the simplest first.
 
     Args:
-        physical: candidates without a learner; one is put on what the best of them leaves.
+        physical: candidates without a learner; one is put on what each of them leaves.
         nominal_too: whether it may learn everything, on the nominal machine.
         learns: whether there is a learner at all.
     """
@@ -195,18 +197,27 @@ def _errors(
             moved = joints + _learned(mechanism, records, targets, folds, seed, physics.values)(joints)
         return square(torch.stack([physics.poses(k, at) for k, at in enumerate(moved)]), pose)
 
-    rows = {c: error(c) for c in physical}
-    learned = []
-    if physical and learns:
-        best = min(physical, key=lambda c: float((rows[c].nan_to_num(1e6) * held).sum(-1).median()))
-        learned.append(best._replace(learner=True))
-    # Physics first: what it knows holds beside the measured region as well.
-    learned += [Candidate(False, False, True)] if learns and (nominal_too or not physical) else []
-    rows |= {c: error(c) for c in learned}
-    # A gross outlier is no evidence for any of them, and would decide alone.
+    # Physics first: what it knows holds beside the measured region as well. What effects leave that stand for others may
+    # be rougher than what all of them do: no learner on that tells of one on geometry alone.
+    learned = [c._replace(learner=True) for c in physical]
+    learned += [Candidate(False, False, True)] if nominal_too or not physical else []
+    return by_fold({c: error(c) for c in (*physical, *(learned if learns else []))}, held)
+
+
+def by_fold(rows: dict[Candidate, Tensor], held: Tensor) -> dict[Candidate, Tensor]:
+    """Mean over the held-out rows of each fold, `k` [m²], of squared errors that are bounded.
+
+    Args:
+        rows: squared errors of each candidate, `k x s` [m²]; NaN where none is known.
+        held: 1 for rows that a fold holds out, `k x s`.
+    """
+    # A gross outlier is no evidence for any of them, and would decide alone; so would rows at the edges of what was
+    # measured, which err by many times as much under all of them (a bounded loss: Geman and McClure 1985).
     length = torch.stack([r.nan_to_num(math.inf) for r in rows.values()]).amin(0).sqrt()
     held = held * inlying(length, held > 0, 3, 0)
-    return {c: (values.nan_to_num(1e6) * held).sum(-1) / held.sum(-1) for c, values in rows.items()}
+    most = (_BOUND * length[held > 0].median()).square()
+    bounded = {c: most * (values := r.nan_to_num(1e6)) / (most + values) for c, r in rows.items()}
+    return {c: (values * held).sum(-1) / held.sum(-1) for c, values in bounded.items()}
 
 
 def _learned(
@@ -247,6 +258,6 @@ def simplest_of_best(errors: dict[Candidate, Tensor], asked: str, unit: str = "m
     # The one with the least mean is beaten by none.
     chosen = next(c for c, beaten in zip(errors, is_beaten, strict=True) if not beaten)
     said = ", ".join(f"{c.words} {1e3 * math.sqrt(float(e.mean())) / length:.3g} {unit}" for c, e in errors.items())
-    why = f"{chosen.words.capitalize()}: the simplest of the best in cross-validation (held-out RMS: {said})."
+    why = f"{chosen.words.capitalize()}: the simplest of the best in cross-validation (held-out RMS, large errors bounded: {said})."
     method = _LEARNER if chosen.learner else "constant"
     return ModelChoice(chosen.identify, chosen.effects, method, f"{asked} {why}".strip(), "folds")
