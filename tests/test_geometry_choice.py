@@ -116,13 +116,13 @@ def test_a_larger_model_has_to_be_better_by_two_standard_errors(left: tuple[floa
 
 
 def test_rows_at_the_edge_that_err_under_all_candidates_do_not_decide() -> None:
-    """Of a real UR10 three rows of a hundred err by ten times the usual, and hid that a learner halves the others."""
+    """Of a real UR10 some rows of a hundred err by ten times the usual, and hid that a learner halves the others."""
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(100, 3, generator=generator, dtype=torch.float64).square().sum(-1)
     effects, learner = Candidate(True, True, False), Candidate(True, False, True)
     rows = {effects: (1e-4) ** 2 * noise, learner: (6e-5) ** 2 * noise}
-    for k in (7, 40, 90):
-        rows[effects][k], rows[learner][k] = 1e-6, 1.2e-6
+    for k in range(5):
+        rows[effects][k], rows[learner][k] = (k + 1) * 1e-6, (5 - k) * 1e-6
     held = torch.nn.functional.one_hot(torch.arange(100) % 5).mT.double()
     errors = by_fold({c: r.expand(5, -1) for c, r in rows.items()}, held)
     assert simplest_of_best(errors, "").effects is False

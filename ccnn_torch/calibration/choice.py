@@ -197,8 +197,8 @@ def _errors(
             moved = joints + _learned(mechanism, records, targets, folds, seed, physics.values)(joints)
         return square(torch.stack([physics.poses(k, at) for k, at in enumerate(moved)]), pose)
 
-    # Physics first: what it knows holds beside the measured region as well. What effects leave that stand for others may
-    # be rougher than what all of them do: no learner on that tells of one on geometry alone.
+    # Physics first: what it knows holds beside the measured region as well. What effects that stand for others
+    # leave may be rougher than what is there without them: a learner on that says nothing of one on geometry alone.
     learned = [c._replace(learner=True) for c in physical]
     learned += [Candidate(False, False, True)] if nominal_too or not physical else []
     return by_fold({c: error(c) for c in (*physical, *(learned if learns else []))}, held)
@@ -258,6 +258,7 @@ def simplest_of_best(errors: dict[Candidate, Tensor], asked: str, unit: str = "m
     # The one with the least mean is beaten by none.
     chosen = next(c for c, beaten in zip(errors, is_beaten, strict=True) if not beaten)
     said = ", ".join(f"{c.words} {1e3 * math.sqrt(float(e.mean())) / length:.3g} {unit}" for c, e in errors.items())
-    why = f"{chosen.words.capitalize()}: the simplest of the best in cross-validation (held-out RMS, large errors bounded: {said})."
+    best = f"{chosen.words.capitalize()}: the simplest of the best in cross-validation"
+    why = f"{best} (held-out RMS, large errors bounded: {said})."
     method = _LEARNER if chosen.learner else "constant"
     return ModelChoice(chosen.identify, chosen.effects, method, f"{asked} {why}".strip(), "folds")
