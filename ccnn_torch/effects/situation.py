@@ -334,7 +334,8 @@ class Situation:
         """Force and moment about the base frame's axes of the load on the platform, `... x s x c` [N, N·m].
 
         The load is given along the pose coordinates; moments on an arm are about the axes of the base frame, and are
-        not there (c = 3) where its position alone is measured and none was recorded.
+        not there (c = 3) where its position alone is measured and none was recorded. A platform whose mass is told
+        hangs with a load that was recorded.
         """
         zero = torch.zeros_like(self.joints[..., 0])
         along = [self.covariates.get(name) for name in load_columns(self.mechanism)]
@@ -343,8 +344,9 @@ class Situation:
         force = torch.stack([zero if q is None else q.expand_as(zero) for q in along], -1)
         if self.mechanism.orientations:
             return force
-        held: Tensor = self.holding @ force.unsqueeze(-1)
-        return held.squeeze(-1)
+        held = (self.holding @ force.unsqueeze(-1)).squeeze(-1)
+        own = self.loaded * self.mechanism.platform_mass * self.gravity
+        return held + torch.nn.functional.pad(own, (0, held.shape[-1] - len(own)))
 
     @cached_property
     def holding(self) -> Tensor:
@@ -400,11 +402,12 @@ class Situation:
 
     @cached_property
     def carried_torque(self) -> Tensor:
-        """Force or torque on each joint of the load, and of the own weight that the machine's file tells (masses of an
-        arm, or of a platform), by virtual work, `... x s x n` [N or N·m]: what springs of the drives carry."""
-        machine = self.whole.mechanism
-        masses = machine.masses.sum() if isinstance(machine, SerialArm) else machine.platform_mass
-        return self.load_torque + STANDARD_GRAVITY * masses * self.own_weight_torque
+        """Force or torque on each joint of the load, and of an arm's own weight where its file tells its masses, by
+        virtual work, `... x s x n` [N or N·m]: what springs of the drives carry."""
+        arm = self.whole.mechanism
+        if not isinstance(arm, SerialArm) or not len(arm.masses):
+            return self.load_torque
+        return self.load_torque + STANDARD_GRAVITY * arm.masses.sum() * self.own_weight_torque
 
     @cached_property
     def inner_weight_torque(self) -> Tensor:
