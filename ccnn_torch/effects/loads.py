@@ -85,8 +85,8 @@ _TYPICAL = {"m": 100.0, "rad": 30.0}
 
 
 class Compliance(Effect):
-    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = force or torque of the load on the joint, and of the
-    own weight that the file tells (masses of an arm, of a platform): one spring carries both; members that give, e_k.
+    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = force or torque of the load on the joint, and of an
+    arm's own weight where its file tells its masses: one spring carries both; and members that give, e_k.
 
     τ_0 = 100 N or 30 N·m: d and h are changes of compliance there. Secondary as well, the members: a leg stretches in
     all its lengths p in proportion to the force of the load on them, Δp = e (∂x/∂p) · load (virtual work); a link of an

@@ -334,8 +334,7 @@ class Situation:
         """Force and moment about the base frame's axes of the load on the platform, `... x s x c` [N, N·m].
 
         The load is given along the pose coordinates; moments on an arm are about the axes of the base frame, and are
-        not there (c = 3) where its position alone is measured and none was recorded. A platform whose mass is told
-        hangs with a load that was recorded.
+        not there (c = 3) where its position alone is measured and none was recorded.
         """
         zero = torch.zeros_like(self.joints[..., 0])
         along = [self.covariates.get(name) for name in load_columns(self.mechanism)]
@@ -344,9 +343,8 @@ class Situation:
         force = torch.stack([zero if q is None else q.expand_as(zero) for q in along], -1)
         if self.mechanism.orientations:
             return force
-        held = (self.holding @ force.unsqueeze(-1)).squeeze(-1)
-        own = self.loaded * self.mechanism.platform_mass * self.gravity
-        return held + torch.nn.functional.pad(own, (0, held.shape[-1] - len(own)))
+        held: Tensor = self.holding @ force.unsqueeze(-1)
+        return held.squeeze(-1)
 
     @cached_property
     def holding(self) -> Tensor:

@@ -79,8 +79,6 @@ class Mechanism(nn.Module):
         motors: how far each motor turns, over its gear, for one unit of each joint, `n x n`; () where each joint has a
             motor of its own. What acts in the drives (gears, backlash, springs) is then of the motors, by the names of
             their joints.
-        platform_mass: of what the legs of a parallel machine carry beside a load that is recorded [kg]; 0 where it is
-            not known.
     """
 
     nominal: Tensor
@@ -94,7 +92,6 @@ class Mechanism(nn.Module):
     tool_per: tuple[str, ...] = ()
     gears: tuple[float | None, ...] = ()
     motors: Motors = ()
-    platform_mass: float = 0.0
     closed_form: Literal["forward", "inverse"] | None = None
 
     def __init__(

@@ -30,7 +30,7 @@ from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 from ccnn_torch.plugins import class_hint, code_refused, file_that_names, is_plugin, load_plugin, users_code
 from ccnn_torch.spelling import hint
-from ccnn_torch.units import LARGEST, amount
+from ccnn_torch.units import amount
 
 _POSES, _STEPS = 256, 8
 # A walk whose joints change by more than this in a step, or that differs by less from the direct answer, is not
@@ -272,7 +272,7 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
             framed: mechanism, its keys, base, tool, frame_per, tool_per; partial: mechanism, its keys, pose;
             instrument: mechanism, its keys, kind, link, and those of the kind, or instruments; …); of any machine
-            `gears` and `motors`, see `read_gears`, `read_motors`, and of one that is no arm `platform_mass` [kg].
+            `gears` and `motors`, see `read_gears`, `read_motors`.
 
     Raises:
         InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, a
@@ -296,8 +296,8 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         return load_machine(spec, allow_code=allow_code)
     maker = _maker(spec)
     taken = inspect.signature(maker).parameters
-    of_any = [key for key in ("gears", "motors", "platform_mass") if spec not in _EXAMPLES and key not in taken]
-    apart = {key: keys.pop(key) for key in of_any if key in keys}
+    of_drives = [key for key in ("gears", "motors") if spec not in _EXAMPLES and key not in taken]
+    apart = {key: keys.pop(key) for key in of_drives if key in keys}
     if is_plugin(spec):
         mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
     else:
@@ -311,28 +311,9 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         mechanism.gears, apart["gears"] = tuple(told), told
     if "motors" in apart:
         mechanism.motors = read_motors(apart["motors"], mechanism.joints, f"mechanism '{spec}': motors")
-    if "platform_mass" in apart:
-        apart["platform_mass"] = _platform_mass(apart["platform_mass"], mechanism, f"mechanism '{spec}': platform_mass")
-        mechanism.platform_mass = apart["platform_mass"]
     if apart:
         mechanism.recipe["keys"].update(apart)
     return mechanism
-
-
-def _platform_mass(told: Any, mechanism: Mechanism, where: str) -> float:
-    """Mass of a platform [kg].
-
-    Raises:
-        InputError: it is none, or the machine is an arm.
-    """
-    if isinstance(mechanism, SerialArm):
-        raise InputError(
-            f"{where}: {mechanism.name} is an arm; write the masses of its links, masses: […], in its file"
-        )
-    mass = amount(str(told), "kg", where)
-    if not 0 < mass < LARGEST:
-        raise InputError(f"{where}: {told} is no mass; write it as 2.8 kg")
-    return mass
 
 
 def mechanism_from_description(description: Mapping[str, Any], allow_code: bool = False) -> Mechanism:

@@ -2,8 +2,8 @@
 
 `python -m ccnn_validation.quattro --seed N [--machines K] [--rows N] [--keep DIR]`. 80 places with 0, 1.5 and 3 kg, two
 thermometers, ways of approach. Judged are 200 places of another day under 1 and 2.5 kg, in the frame that suits what is
-reached best (six numbers; the turn of the flange but for its mean): as drawn, ours by the written file (without and
-with what the plate weighs), a plain script (geometry alone) and a fuller one (`quattro_script`).
+reached best (six numbers; the turn of the flange but for its mean): as drawn, ours by the written file, a plain
+script (geometry alone) and a fuller one (`quattro_script`).
 """
 
 from __future__ import annotations
@@ -24,9 +24,8 @@ Array = NDArray[np.float64]
 NEW = 200
 CLASS = Path(__file__).with_name("quattro_class.py")
 CONFIG = """mechanism: quattro_class.py:Quattro
-mechanism_keys: {gears: [33, 33, 33, 33]KEYS}
+mechanism_keys: {gears: [33, 33, 33, 33]}
 """
-OURS = {"ours": "", "ours, mass": ", platform_mass: 2.8 kg"}
 
 
 def poses(count: int, rng: np.random.Generator, share: float) -> Array:
@@ -49,7 +48,7 @@ def told(at: Conditions) -> Rows:
 
 
 def by_package(
-    joints: Array, at: Conditions, places: Array, target: Array, after: Conditions, folder: Path, keys: str
+    joints: Array, at: Conditions, places: Array, target: Array, after: Conditions, folder: Path
 ) -> Array | None:
     """Commands by the file that the program writes."""
     angles = ",".join(f"q{i}[rad]" for i in range(1, 5))
@@ -57,9 +56,7 @@ def by_package(
     records = f"{angles},x[m],y[m],z[m],{names}", np.c_[joints, places, known]
     targets = f"{angles},{names}", np.c_[target, after.columns()[1]]
     flags = "--allow-code"
-    config = CONFIG.replace("KEYS", keys)
-    folder.mkdir(exist_ok=True)
-    return commanded(folder, CLASS.read_text(), records, targets, config=config, file="quattro_class.py", flags=flags)
+    return commanded(folder, CLASS.read_text(), records, targets, config=CONFIG, file="quattro_class.py", flags=flags)
 
 
 def judged(seed: int, rows: int, folder: Path) -> dict[str, tuple[float, ...]]:
@@ -77,8 +74,7 @@ def judged(seed: int, rows: int, folder: Path) -> dict[str, tuple[float, ...]]:
     fuller, causes = fitted(joints, places, told(at))
     sent: dict[str, Array | None] = {"as drawn": target, "plain script": send(new, numbers)}
     sent["fuller script"] = send(new, fuller, told(after), causes)
-    for who, keys in OURS.items():
-        sent[who] = by_package(joints, at, places, target, after, folder / who.replace(", ", "_"), keys)
+    sent["ours"] = by_package(joints, at, places, target, after, folder)
     found: dict[str, tuple[float, ...]] = {}
     for who, commands in sent.items():
         if commands is None or np.isnan(commands).any():

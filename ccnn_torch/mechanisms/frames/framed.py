@@ -98,7 +98,6 @@ class Framed(Around):
             home_joints=inner.home_joints.tolist(),
         )
         self.mechanism, self.takes, self.gears, self.motors = inner, inner.takes, inner.gears, inner.motors
-        self.platform_mass = inner.platform_mass
         self.base, self.tool, self.rotation_weight = base, tool, rotation_weight
         self.frame_per, self.tool_per = tuple(frame_per), tuple(tool_per)
         # Where the coordinates of the mechanism's pose are those of its frame there is nothing to search.

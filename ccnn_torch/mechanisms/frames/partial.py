@@ -74,7 +74,6 @@ class Seen(Around, ABC):
         )
         self.nominal[: len(inner.nominal)].copy_(inner.nominal)
         self.mechanism, self.takes, self.gears, self.motors = inner, inner.takes, inner.gears, inner.motors
-        self.platform_mass = inner.platform_mass
 
     def inner_values(self, parameters: Tensor | None) -> Tensor | None:
         """Of the parameters `... x k` those of the mechanism inside; None where none are given."""
