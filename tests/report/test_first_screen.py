@@ -199,6 +199,18 @@ def test_places_are_told_in_words() -> None:
     assert where_words(none()[0], About()) == []
 
 
+def test_numbers_that_a_file_calls_alike_are_told_apart() -> None:
+    numbers = {f"base{i}": (4e-4 * i, 1e-5, "m", f"leg {i}", 0.2) for i in (1, 2)} | {
+        "rod1": (3e-4, 1e-5, "m", "leg 1", 0.4)
+    }
+    results = _with("geometry", numbers)
+    for name, block in results["effects"][0]["parameters"].items():
+        block["word"] = "rod A" if name == "rod1" else "delta radius"
+    table = numbers_table(results, 10)
+    assert table is not None
+    assert {row[0] for row in table.rows} == {"delta radius, leg 1", "delta radius, leg 2", "rod A"}
+
+
 def test_a_joint_whose_error_has_no_name_is_not_said_to_have_none() -> None:
     about = {"classes": {}, "probability": 0.999, "gap_before": 2e-3, "gap_after": 1e-3}
     joints = [

@@ -347,7 +347,10 @@ def _number_rows(results: Block, effect: str, most: int) -> tuple[list[tuple[str
         value, error = block["value"], _Z95 * block["sd"]
         part = block.get("part") or ""
         enter = "–" if block.get("nominal") is None or not repairs else to_enter(block, block["nominal"] + value)
-        text = f"{block.get('word') or _named(name, part)}{_often(name, parameters)}{_counted(block)}"
+        word = block.get("word") or _named(name, part)
+        # A machine's file may have one number for what each leg has of its own.
+        word += f", {part}" * (word in [b.get("word") for n, b in clear.items() if n != name])
+        text = f"{word}{_often(name, parameters)}{_counted(block)}"
         rows.append((text, told_words(block, value, 4), f"± {told_words(block, error, 2, value)}", enter))
     notes += [_OWN_UNIT] if any(not block["unit"] for block in clear.values()) else []
     notes += [words_of(effect).meaning] if clear and words_of(effect).meaning else []
