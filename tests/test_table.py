@@ -109,7 +109,7 @@ def test_bad_cell_is_named_when_its_column_is_asked_for(tmp_path: Path, cell: st
 
 def test_further_bad_cells_are_counted(tmp_path: Path) -> None:
     table = read_table(write(tmp_path, "x[mm]\n1\nnan\nnan\nfoo\n"))
-    with pytest.raises(InputError, match=r"line 3 \(row 2\), and 2 more of its cells"):
+    with pytest.raises(InputError, match=r"lines 3, 4 \(rows 2, 3\), and 1 more of its cells is not"):
         table.column("x")
 
 

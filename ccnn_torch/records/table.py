@@ -139,7 +139,7 @@ class Table:
             rows, text = wrong[[text == texts[0] for text in texts]], visible(texts[0], 40)
             what = f"has '{text}'" if text else "is empty"
             rest = len(wrong) - len(rows)
-            more = f", and {rest} more of its cells are not finite either" if rest else ""
+            more = f", and {rest} more of its cells {'is' if rest == 1 else 'are'} not finite either" if rest else ""
             more += "" if text else self._other_gaps(name)
             remedy = f"write a finite number or remove the row{'s' if more or len(rows) > 1 else ''}"
             if _GROUPED.fullmatch(text):
