@@ -80,6 +80,11 @@ class FoundMachine(NamedTuple):
         return self.nominal.with_nominal(self.values)
 
     @property
+    def measured(self) -> Tensor | None:
+        """Lowest and highest joints of the records, `n x 2` [SI]; None where they are not known."""
+        return next((ends for ends in (self.joints, self.beside) if len(ends)), None)
+
+    @property
     def travel(self) -> Tensor | None:
         """As of `Situation`."""
         return self.joints.mT if len(self.joints) else None

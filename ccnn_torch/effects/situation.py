@@ -288,8 +288,7 @@ class Situation:
         if self.travel is None:
             return None
         low, high = self.travel
-        inside = torch.minimum(torch.maximum(self.joints, low), high)
-        motors = self.mechanism.motors
+        motors, inside = self.mechanism.motors, torch.minimum(torch.maximum(self.joints, low), high)
         far = high - low if not motors else torch.tensor(motors, dtype=low.dtype).abs() @ (high - low)
         return turns_of(motors, inside), far
 

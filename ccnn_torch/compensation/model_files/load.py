@@ -355,39 +355,29 @@ class LoadedModel:
 
     @cached_property
     def region(self) -> Array:
-        """Lowest and highest joints of the domain, `n x 2` [SI]; of a machine those measured, or all over its workspace
-        where it holds there."""
+        """Lowest and highest joints of the domain, `n x 2` [SI]; of a machine those measured, or of its workspace."""
         if self.machine is None:
             edges = [self.facts["domain"]["inputs"][c.name] for c in self.joints]
             return np.array([[edge["low"], edge["high"]] for edge in edges])
-        measured = self.machine.joints
-        if not len(measured):
-            import torch
-
+        if not len(self.machine.joints):
             from ccnn_torch.compensation.fit import rows_of
 
-            joints = rows_of(self.machine).joints
-            fine = joints[torch.isfinite(joints).all(-1)]
-            measured = torch.stack([fine.amin(0), fine.amax(0)], -1)
-        region: Array = measured.numpy()
-        return region
+            joints = rows_of(self.machine).joints.numpy()
+            fine = joints[np.isfinite(joints).all(-1)]
+            return np.stack([fine.min(0), fine.max(0)], -1)
+        return np.asarray(self.machine.joints)
 
     @property
     def measured(self) -> Array:
         """Lowest and highest joints of the records, `n x 2` [SI]; the region where these are not known."""
-        beside = None if self.machine is None or not len(self.machine.beside) else self.machine.beside
-        measured: Array = self.region if beside is None else beside.numpy()
-        return measured
+        return np.asarray(self.region if self.machine is None or (m := self.machine.measured) is None else m)
 
     @property
     def middle(self) -> Array:
         """Joints to begin a search from: middle of those measured, of a machine without any its home, `n` [SI]."""
-        unknown = self.machine is not None and not (len(self.machine.joints) or len(self.machine.beside))
-        if self.machine is not None and unknown:
-            home: Array = self.machine.nominal.home_joints.numpy()
-            return home
-        middle: Array = self.measured.mean(-1)
-        return middle
+        if self.machine is None or self.machine.measured is not None:
+            return np.asarray(self.measured.mean(-1))
+        return np.asarray(self.machine.nominal.home_joints)
 
     def back(self, command: ArrayLike, covariates: ArrayLike | None = None) -> Array:
         """Ideal joints of commands (or of joints fed back), `... x n` [SI]; arguments and errors as a call."""
