@@ -215,6 +215,14 @@ def test_a_killed_run_resumes_to_the_same(cli: Cli, played: Path, tmp_path: Path
     assert first["methods"]["bp_lm"]["test"] == again["methods"]["bp_lm"]["test"]
 
 
+def test_a_learner_is_compared_on_geometry_alone_and_beside_effects(played: Path) -> None:
+    """Effects that stand for others may leave what no learner makes anything of."""
+    found = prepare(RunConfig.from_keys(**keys(played, effects="auto")))
+    assert found.choice is not None
+    for parts in ("identified geometry", "identified geometry + effects"):
+        assert f"{parts} + learner " in found.choice.why
+
+
 def usual(effect: Effect, situation: Situation) -> Tensor:
     """Shapes that a simulation takes."""
     values = [s.grid[len(s.grid) // 2] if s.usual is None else s.usual for s in effect.shapes(situation)]
